@@ -15,7 +15,8 @@ from ..errors import ConfigurationError, Interrupted, MeshLost, from_report
 from ..files import write_whole
 from ..hosts.compose import compose_file
 from ..hosts.kubernetes import manifests
-from ..hosts.slurm import SlurmJob, batch_script, followed, submitted
+from ..hosts.slurm import SlurmJob, submitted
+from ..hosts.slurm_mesh import batch_script, followed
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
 from ..text import short_path
@@ -38,13 +39,14 @@ def _render(arguments: argparse.Namespace) -> int:
         "--image": engine == "slurm" and image is not None,
         "--claim": engine != "kubernetes" and claim is not None,
         "--slurm-option": engine != "slurm" and bool(arguments.slurm_option),
+        "--resume": engine != "slurm" and bool(arguments.resume),
     }
     for flag in (flag for flag, is_wrong in wrong.items() if is_wrong):
         raise ConfigurationError(f"`render {engine}` takes no {flag}")
     run, words = _planned(arguments), forwarded(arguments)
     match engine:
         case "slurm":
-            text = batch_script(run, words, arguments.slurm_option).text
+            text = batch_script(run, words, arguments.slurm_option, resume=bool(arguments.resume)).text
         case "compose":
             text = compose_file(run, words, image=image or _IMAGE)
         case _:
@@ -73,7 +75,8 @@ def _submit(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(text, hint="It is beside the result, which all hosts have to share.") from error
     job = None
     try:
-        script = batch_script(run, forwarded(arguments), arguments.slurm_option, folder=folder)
+        words, resume = forwarded(arguments), bool(arguments.resume)
+        script = batch_script(run, words, arguments.slurm_option, folder=folder, resume=resume)
         job = submitted(folder / "mesh.sbatch", script.text)
     finally:
         if job is None:

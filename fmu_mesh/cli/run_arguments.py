@@ -38,6 +38,7 @@ _FMU = argument("fmu", "MODEL.fmu", "the FMU", type=Path)
 _PLOT = argument("--plot", "FILE.png", "plot the result at the end", type=Path)
 _OUTPUT = (switch("--no-progress", text="no progress line"), QUIET)
 """What a run prints."""
+_EVENTS = argument("--events", "FILE.jsonl", "also write the events of the run into a file, as JSON lines", type=Path)
 _OUTCOME = json_switch("print the outcome as one JSON object, and nothing else on standard output")
 
 
@@ -122,6 +123,7 @@ PARSERS: Parsers = {
         options("state", "replaced", "paused", "view", "video", "profile", "processes", "restarts", "resume"),
         _PLOT,
         *_OUTPUT,
+        _EVENTS,
         _OUTCOME,
     ),
     "node": (
@@ -134,7 +136,7 @@ PARSERS: Parsers = {
         options("paused", "profile"),
         _PLOT,
         *_OUTPUT,
-        argument("--events", "FILE.jsonl", "also write the events of the run into a file, as JSON lines", type=Path),
+        _EVENTS,
     ),
     "gateway": (*CONFIGURED, QUIET),
     "router": (
@@ -236,6 +238,7 @@ PARSERS: Parsers = {
     "render": (
         argument("engine", "ENGINE", "slurm, compose or kubernetes", choices=("slurm", "compose", "kubernetes")),
         *PLACED,
+        options("resume"),
         _add_target,
         argument("--image", "IMAGE", "of compose and kubernetes: the image with fmu-mesh; default: fmu-mesh"),
         argument(
@@ -249,6 +252,7 @@ PARSERS: Parsers = {
     "submit": (
         argument("engine", "ENGINE", "slurm", choices=("slurm",)),
         *PLACED,
+        options("resume"),
         _SLURM_OPTION,
         *_OUTPUT,
     ),

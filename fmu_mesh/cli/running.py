@@ -30,6 +30,7 @@ from ..config.access_sections import given_folder, has_tls, why_open
 from ..errors import ConfigurationError, FmuMeshError
 from ..run.events import Event, EventWriter, Reachable, Status
 from ..run.options import RerunOptions
+from ..run.outcome import Outcome, outcome_at
 from ..run.process import ended_by_signals
 from ..run.run_plan import RunPlan
 from ..run.wiring import identity_of, warnings_of
@@ -110,15 +111,26 @@ def _shown(
         ) as display,
         interrupted_by_signals() as runs,
     ):
+        write = _also_written(lambda _event: None, getattr(arguments, "events", None))
 
         def show(event: Event) -> None:
             reporter.event(event)
             display.event(event)
+            if not isinstance(event, Outcome):  # this process knows more than the master
+                write(event)
 
-        run = Run.start(plan, **how, on_event=show)
-        runs.append(run)
-        drive(run)
-        return run.wait()
+        try:
+            run = Run.start(plan, **how, on_event=show)
+            runs.append(run)
+            drive(run)
+            result = run.wait()
+        except FmuMeshError as error:
+            known = error.result.outcome if error.result is not None else None
+            write(replace(known or outcome_at(plan.plan, 0), state="failed", error=error.report()))
+            raise
+        assert result.outcome is not None  # it has run
+        write(result.outcome)
+        return result
 
 
 def planned_run(mesh: Mesh, options: dict[str, Any], arguments: argparse.Namespace) -> RunPlan:

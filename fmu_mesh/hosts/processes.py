@@ -1,7 +1,7 @@
 """The processes of a mesh as an engine starts them: what each runs, what it may take, and how they meet.
 
-The master listens at a port, and all others connect to it. Knows no engine: `slurm`, `compose` and `kubernetes` write
-the processes in the words of theirs.
+The master listens at a port, and all others connect to it. Knows no engine: `slurm_mesh`, `compose` and `kubernetes`
+write the processes in the words of theirs.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class MeshProcess(msgspec.Struct, frozen=True):
     """One process of a mesh.
 
     Attributes:
-        name: of the node; or `master`, or `gateway`.
-        role: `node`, `master` or `gateway`.
+        name: of the node; or `master`, `launch`, or `gateway`.
+        role: `node`, `master`, `launch` or `gateway`.
         words: the arguments of `fmu-mesh`; a file is an absolute `Path`, which a container has elsewhere.
         memory: the most bytes that it needs; None: nobody knows.
         host: the host that the configuration names for it; None: any.
@@ -51,27 +51,36 @@ class MeshProcess(msgspec.Struct, frozen=True):
 
 
 def processes_of(
-    run: RunPlan, options: Sequence[str | Path], *, address: str, port: str, security: Callable[[str], str | Path]
+    run: RunPlan,
+    options: Sequence[str | Path],
+    *,
+    address: str | None,
+    port: str,
+    security: Callable[[str], str | Path],
 ) -> tuple[MeshProcess, ...]:
-    """The processes of a mesh, the master first.
+    """The processes of a mesh, the master first, or the `launch` that starts all others on its host.
 
     Args:
         run: its plan, made with the same options.
         options: the options of all of them, as the command line takes them.
-        address: where the others find the master; it may be a word of a shell.
+        address: where the others find the master; it may be a word of a shell. None: a `launch` starts them.
         port: that of the master, likewise.
         security: the folder of the certificate of a role where its process runs.
 
     Raises:
         ConfigurationError: the mesh cannot be started in parts; or nobody has said who may reach it.
     """
-    config, plan = run.loaded.config, run.plan
-    if config.zenoh.mode == "client":
+    config, plan, launched = run.loaded.config, run.plan, address is None
+    if config.zenoh.mode == "client" and not launched:
         text = f"mesh '{run.mesh}' has `zenoh.mode: client`, and an engine starts processes that meet at the master"
         raise ConfigurationError(text, hint="Leave `mode` and `connect` out.")
-    if config.security is None and not config.zenoh.insecure:
+    if config.security is None and not config.zenoh.insecure and not launched:
         text = f"the processes of mesh '{run.mesh}' meet at a network, and nobody has said who may reach it"
         hint = "Give `security=...` (`fmu-mesh security init` begins); or `insecure=True`: everybody there."
+        raise ConfigurationError(text, hint=hint)
+    if config.recovery.directory is not None and not launched:
+        text = f"`recovery.directory` of mesh '{run.mesh}' has no effect where an engine starts its processes"
+        hint = "Add `--set-config recovery.directory=null`. With Slurm, a mesh without a `host` can be resumed."
         raise ConfigurationError(text, hint=hint)
     nodes = [node for name, node in plan.nodes.items() if name != RECORDER]
     if boxed := [f"node '{node.node}'" for node in nodes if node.process.is_sandboxed]:
@@ -80,14 +89,18 @@ def processes_of(
     scheme = "tcp" if config.security is None else "tls"
 
     def words(role: str, *own: str | Path) -> tuple[str | Path, ...]:
-        access = ("--insecure",) if config.security is None else ("--security", security(role))
-        if role == "master":
+        access: tuple[str | Path, ...] = ("--insecure",) if config.zenoh.insecure else ()
+        access = access if config.security is None else ("--security", security(role))
+        if role == "launch":
+            own = ("--no-progress",)
+        elif role == "master":
             own = ("--listen", f"{scheme}/0.0.0.0:{port}", "--no-progress")
         else:
             own = (*own, "--connect", f"{scheme}/{address}:{port}")
         return (role, run.config_file, *own, *access, *options)
 
-    made = [MeshProcess("master", "master", words("master"))]
+    first = "launch" if launched else "master"
+    made = [MeshProcess(first, first, words(first))]
     for node in nodes:
         limit = node.process.memory_bytes
         memory = None if limit is None else limit + _OWN_BYTES

@@ -1,8 +1,7 @@
-"""Slurm: its programs, a mesh as a batch script, and what is known of a job that runs.
+"""Slurm: its programs, and what is known of a job; `slurm_mesh` has the job of a mesh, and `sweeps` that of a sweep.
 
-In the script, the first host runs the master, and `srun --multi-prog` starts the nodes, which connect to it. Nodes with
-the same `host` are a component of a heterogeneous job, on one machine. It knows the programs of Slurm and what they
-print, and needs no accounting database: where there is one, it also tells how jobs ended that `squeue` has forgotten.
+It knows the programs of Slurm and what they print, and needs no accounting database: where there is one, it also tells
+how jobs ended that `squeue` has forgotten.
 """
 
 from __future__ import annotations
@@ -12,36 +11,23 @@ import re
 import shlex
 import signal
 import subprocess
-import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
-from msgspec.structs import replace
 
-from .. import __version__
-from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError, MeshLost
+from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..files import write_whole
-from ..run.events import Event, decode_event
-from ..run.outcome import Outcome
-from ..run.run_plan import RunPlan
-from .processes import MeshProcess, identity_folder, processes_of
 
 __all__ = [
     "COMPLETED",
     "ENDED",
-    "MeshScript",
     "SlurmJob",
     "accounted",
-    "batch_script",
     "cancel",
     "check_option",
     "end_of_log",
-    "followed",
     "log_option",
     "queued",
     "submitted",
@@ -49,24 +35,14 @@ __all__ = [
 
 _LOG: Final = "slurm-{task}.log"
 _SUBMIT_S, _ASK_S = 60.0, 30.0
-_LOOK_S, _POLL_S = 1.0, 10.0
-"""Time in s between two questions: the controller serves all users."""
-_SILENCE_S: Final = 600.0
-"""How long Slurm may leave questions without an answer, in s."""
-_REST_S: Final = 60
-"""How long the other tasks may go on when one has ended, in s."""
 _TAIL = 1 << 16
 """Length in bytes of the end of a log that is looked at."""
-_EVENTS: Final = "events.jsonl"
 
 COMPLETED: Final = "COMPLETED"
 ENDED: Final = frozenset(
     f"BOOT_FAIL CANCELLED {COMPLETED} DEADLINE FAILED NODE_FAIL OUT_OF_MEMORY PREEMPTED REVOKED TIMEOUT".split()
 )
 """States in which a task never runs again. A task that Slurm queues again is PENDING (squeue, job state codes)."""
-
-_OWN_OPTIONS: Final = {"--chdir": "-D", "--error": "-e", "--ntasks": "-n", "--output": "-o", "--wait": "-W"}
-"""Options of `sbatch` that belong to the job of a mesh, with their short form."""
 
 _OVERRULING: Final = (
     *("SBATCH_ARRAY_INX", "SBATCH_ERROR", "SBATCH_OPEN_MODE", "SBATCH_OUTPUT", "SBATCH_WAIT"),
@@ -105,208 +81,6 @@ def log_option(folder: Path, task: str) -> str:
     if not log.isprintable():  # a line break would end the comment; tasks run in this folder anyway
         log = _LOG.format(task=task)
     return f"--output={shlex.quote(log)}"
-
-
-class MeshScript(NamedTuple):
-    """The batch script of a mesh.
-
-    Attributes:
-        text: all of it.
-        components: the names of the processes of each component of the job, in the order of their tasks.
-    """
-
-    text: str
-    components: tuple[tuple[str, ...], ...]
-
-
-def batch_script(
-    run: RunPlan, options: Sequence[str | Path], slurm_options: Sequence[str] = (), *, folder: Path | None = None
-) -> MeshScript:
-    """Write the batch script of a mesh; a job ends with the exit code of the master.
-
-    Args:
-        run: the plan.
-        options: those of the command line with which it was made; all processes get them.
-        slurm_options: more options of `sbatch`, such as ``--partition=short``, for each component of the job.
-        folder: an existing folder that all hosts share, for the log, and for the events of the master, which
-            `followed` reads; None: there are no events, and the log is where `sbatch` puts it.
-
-    Raises:
-        ConfigurationError: the mesh cannot be started in parts, or an option is none.
-    """
-    for option in slurm_options:
-        check_option(option, _OWN_OPTIONS, "the job of a mesh")
-    master, *others = processes_of(
-        run, options, address="$address", port="$port", security=lambda role: identity_folder(run.loaded, role)
-    )
-    groups: dict[str | None, list[MeshProcess]] = {None: []}
-    for process in others:
-        groups.setdefault(process.host, []).append(process)
-    settings = [f"--job-name={shlex.quote(run.mesh)}", "--no-requeue"]
-    settings += [log_option(folder, "1")] if folder is not None else []
-    starts: list[str] = []
-    for number, (host, members) in enumerate(groups.items()):
-        limits = [process.memory for process in members]
-        settings += ["hetjob"] if number else []
-        settings += [f"--ntasks={len(members) + (host is None)}", "--cpus-per-task=1"]  # one more for the master
-        settings += ["--nodes=1"] if host is not None else []
-        settings += [f"--mem-per-cpu={-(-max(filter(None, limits)) >> 20)}M"] if limits and all(limits) else []
-        settings += slurm_options
-        if members:
-            starts += _step(number, f" --het-group={number}" if len(groups) > 1 else "", members)
-    events = ("--events", str(folder / _EVENTS)) if folder is not None else ()
-    text = _SCRIPT.format(
-        version=__version__,
-        mesh=run.mesh,
-        settings="\n".join(f"#SBATCH {setting}" for setting in settings),
-        folder=shlex.quote(os.getcwd()),  # noqa: PTH109  where `launch` would run
-        python=shlex.quote(sys.executable),
-        master=_command(master, shlex.quote, *events),
-        starts="\n".join(starts),
-    )
-    return MeshScript(text, tuple(tuple(process.name for process in members) for members in groups.values()))
-
-
-_SCRIPT: Final = """\
-#!/bin/sh
-{settings}
-# Mesh '{mesh}', written by fmu-mesh {version}. The exit code is that of the master.
-cd {folder} || exit 2
-address=$(hostname)
-port=$({python} -c 'import socket; print(socket.create_server(("", 0)).getsockname()[1])') || exit 2
-tasks=$(mktemp -d) || exit 2
-trap 'rm -r "$tasks"' EXIT
-{master} &
-master=$!
-trap 'kill -TERM "$master"' TERM INT
-{starts}
-wait "$master"; code=$?
-while kill -0 "$master" 2>/dev/null; do wait "$master"; code=$?; done
-wait
-exit "$code"
-"""
-"""A signal interrupts `wait`, so the master is waited for until it is gone."""
-
-
-def _step(number: int, group: str, members: Sequence[MeshProcess]) -> list[str]:
-    """The lines of a script that start the nodes of a component. What srun says of a task gets the number of it.
-
-    With `--label`, no task can write a line that looks like one of srun.
-    """
-    rows = [f"{rank} {_command(process, _for_srun)}" for rank, process in enumerate(members)]
-    options = f"--ntasks={len(members)} --label --wait={_REST_S} --kill-on-bad-exit=0 --multi-prog"
-    named = f"sed -u 's/^srun: error: /&component {number}: /'"
-    return [f'cat >"$tasks/{number}" <<END', *rows, "END", f'srun{group} {options} "$tasks/{number}" 2>&1 | {named} &']
-
-
-def _command(process: MeshProcess, quoted: Callable[[str], str], *more: str) -> str:
-    """The command of a process; where the master is, in words of the shell, is not quoted."""
-    words = [process.python or sys.executable, "-Pm", "fmu_mesh", *map(str, process.words), *more]
-    return " ".join(word if word.endswith(":$port") else quoted(word) for word in words)
-
-
-def _for_srun(word: str) -> str:
-    """A word in a file of `srun --multi-prog`, which has single quotes only, in a here-document of a shell."""
-    if "'" in word or not word.isprintable():
-        text = f"`srun --multi-prog` cannot take {word!r}: there is a quote or a line break in it"
-        raise ConfigurationError(text, hint="Choose another path, or write the value into the configuration.")
-    shown = word if shlex.quote(word) == word and "%" not in word else f"'{word}'"
-    return re.sub(r"([\\$`])", r"\\\1", shown)
-
-
-def followed(
-    job: SlurmJob, script: MeshScript, show: Callable[[Event], None], say: Callable[[str], None] = lambda _text: None
-) -> Outcome:
-    """Follow the job of a mesh to its end, and show the events of its master.
-
-    Args:
-        job: it was submitted with the ``script``, whose folder has the events.
-        script: as `batch_script` has made it.
-        show: gets each event.
-        say: gets why the job waits.
-
-    Returns:
-        The outcome; of an error that says that something was lost, its hint has what Slurm says.
-
-    Raises:
-        MeshLost: the job has ended without an outcome, or Slurm does not answer.
-    """
-    never, events, over = threading.Event(), _Tail(job.script.with_name(_EVENTS)), False
-    answered, asked, told = time.monotonic(), 0.0, ""
-    while True:
-        for line in events.lines():
-            event = decode_event(line)
-            if isinstance(event, Outcome):
-                event = _explained(event, job, script)
-            show(event)
-            if isinstance(event, Outcome):
-                return event
-        if over:
-            text = f"job {job.id} of Slurm has ended, and its master has not told how"
-            raise MeshLost(text, hint=_said(job, script))
-        never.wait(_LOOK_S)
-        now = time.monotonic()
-        if now - asked < _POLL_S:
-            continue
-        asked, lines = now, queued(job, "%T|%r")
-        answered = now if lines is not None else answered
-        if now - answered > _SILENCE_S:
-            raise MeshLost(f"Slurm has not told the state of job {job.id} for {_SILENCE_S:g} s")
-        over = lines is not None and all(line.partition("|")[0] in ENDED for line in lines)
-        waits = next((line for line in lines or () if line.startswith("PENDING|")), "").partition("|")[2]
-        if waits not in ("", "None", told):
-            told = waits
-            say(f"job {job.id} of Slurm waits: {waits}")
-
-
-class _Tail:
-    """The complete lines of a file that grows, each once; the file may not be there yet."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._at = path, 0
-
-    def lines(self) -> Iterator[bytes]:
-        """Those that are new."""
-        with suppress(FileNotFoundError), self._path.open("rb") as file:  # NFS asks its server when it is opened
-            file.seek(self._at)
-            for line in file:
-                if line.endswith(b"\n"):
-                    self._at += len(line)
-                    yield line
-
-
-def _explained(outcome: Outcome, job: SlurmJob, script: MeshScript) -> Outcome:
-    """An outcome with what Slurm says, if something was lost: the job ends at once, and Slurm knows why."""
-    error = outcome.error
-    if error is None or error.exit_code != MeshLost.exit_code:
-        return outcome
-    end, never = time.monotonic() + 2 * _REST_S, threading.Event()
-    while time.monotonic() < end and ((lines := queued(job, "%T")) is None or not ENDED.issuperset(lines)):
-        never.wait(2 * _LOOK_S)
-    hint = f"{error.hint} {_said(job, script)}" if error.hint else _said(job, script)
-    return replace(outcome, error=replace(error, hint=hint))
-
-
-_OF_TASKS: Final = re.compile(r"^srun: error: component (\d+): (\S+): tasks? ([\d,-]+): (?!Exited)(.+)$", re.MULTILINE)
-_OF_STEPS: Final = re.compile(
-    r"^(?:srun|slurmstepd\S*): error: (?!component \d+: \S+: task)(?:component \d+: )?(.+)$", re.MULTILINE
-)
-
-
-def _said(job: SlurmJob, script: MeshScript) -> str:
-    """What Slurm says of a job that has ended: of tasks with the names of their nodes, and of the job."""
-    log, words = end_of_log(job.log()) or "", []
-    for component, host, ranks, reason in _OF_TASKS.findall(log):
-        names = dict(enumerate(script.components)).get(int(component), ())
-        for first, last in re.findall(r"(\d+)(?:-(\d+))?", ranks):
-            tasks = range(int(first), min(int(last or first) + 1, len(names)))
-            words += [f"task {rank} (node '{names[rank]}') on {host}: {reason}" for rank in tasks]
-    words += dict.fromkeys(_OF_STEPS.findall(log))
-    states = [line for line in queued(job, "%T") or () if line not in (COMPLETED, "FAILED")]
-    states = [state for state in accounted(job).values() if not state.startswith(COMPLETED)] or states
-    words += [f"the job ended as {state}" for state in dict.fromkeys(states)]
-    words = words or [f"nothing; the last line of '{job.log()}' is {next(reversed(log.splitlines()), '')!r}"]
-    return f"Slurm says: {'; '.join(words)}."
 
 
 def check_option(option: str, own: Mapping[str, str], whose: str) -> None:

@@ -31,6 +31,7 @@ from typing import Any, Final, TypeVar
 import msgspec
 from msgspec.structs import replace
 
+from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, is_file
 from ..results.formats import required_format
@@ -43,7 +44,7 @@ from .outcome import last_recorded
 from .run_plan import RunPlan
 from .state_file import STATE, again_from_checkpoint, drop_older
 
-__all__ = ["RunDirectory", "Syncing"]
+__all__ = ["RunDirectory", "Syncing", "run_file"]
 
 _RUN: Final = "run"
 _ON_DISK: Final = "on_disk"
@@ -76,6 +77,11 @@ class _OnDisk(msgspec.Struct, frozen=True):
     journals: dict[str, int]
 
 
+def run_file(loaded: LoadedConfig) -> Path:
+    """The file in the directory of a mesh that is there as long as it has a run to resume."""
+    return loaded.resolve(loaded.config.recovery.directory or "").absolute() / _RUN
+
+
 class RunDirectory:
     """The directory of a run; for this run alone, until `close`.
 
@@ -93,7 +99,7 @@ class RunDirectory:
     """
 
     def __init__(self, plan: RunPlan, *, resume: bool) -> None:
-        self._folder = plan.loaded.resolve(plan.loaded.config.recovery.directory or "").absolute()
+        self._folder = run_file(plan.loaded).parent
         self.told: list[str] = []
         self._records = [record.file for record in plan.plan.system.records]
         if not self._records or any(Path(own).suffix == IN_MEMORY or _is_device(Path(own)) for own in self._records):

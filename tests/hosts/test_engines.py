@@ -174,6 +174,68 @@ def test_hosts_and_memory_become_components_of_a_job(tmp_path: Path, capsys: pyt
     subprocess.run(["sh", "-n"], input=script, text=True, check=True, timeout=DEADLINE_S)
 
 
+def kept(folder: Path, **sections: Any) -> Path:  # noqa: ANN401  they are sections
+    """The pair, slow enough to be ended, with what it needs to go on."""
+    pace = {"real_time_factor": 0.4}
+    return write_config(folder, simulation=pace, recovery={"directory": "kept"}, **sections)
+
+
+def test_a_script_that_is_run_again_resumes_its_run(place: Place) -> None:
+    config, run = kept(place.folder), place.folder / "kept" / "run"
+    local = place.run("launch", config, "--local", "--set-config", "recovery.directory=null", "--output", "local.csv")
+    render = place.run("render", "slurm", config, "--set-config", "simulation.window=64", "-o", "job")
+    job = place.start_command(["sh", "job"])
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 0, "rows")
+    job.signal(signal.SIGTERM)
+    interrupted, was_kept = job.wait(), run.exists()
+
+    place.environment |= {"SLURM_RESTART_COUNT": "1"}
+    again = place.start_command(["sh", "job"])
+
+    assert (local.wait(), render.wait(), interrupted, was_kept, again.wait()) == (0, 0, 130, True, 0), place.story()
+    assert "the run is resumed, and goes on from point" in again.errors
+    assert config.with_suffix(".csv").read_bytes() == (place.folder / "local.csv").read_bytes()
+    place.assert_nothing_left(DEADLINE_S)
+
+
+def test_a_script_that_had_not_begun_begins_its_run(place: Place) -> None:
+    config = kept(place.folder)
+    place.run("render", "slurm", config, "-o", "job")
+    place.environment |= {"SLURM_RESTART_COUNT": "1"}
+
+    job = place.start_command(["sh", "job"])
+
+    assert job.wait() == 0, place.story()
+    assert row_count(config.with_suffix(".csv")) == 1001
+
+
+def test_a_job_that_can_be_resumed_is_one_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = kept(tmp_path, process={"memory": "1 GiB"})
+
+    script, resumed = rendered(capsys, "slurm", config), rendered(capsys, "slurm", config, "--resume")
+
+    own = ["--requeue", "--open-mode=append", "--ntasks=1", "--cpus-per-task=3", "--mem-per-cpu=1280M"]
+    assert settings_of(script) == [["--job-name=pair", *own]]
+    assert (re.findall("^resume=.*$", script, re.MULTILINE), re.findall("^resume=.*$", resumed, re.MULTILINE)) == (
+        ["resume="],
+        ["resume=--resume"],
+    )
+
+
+def test_what_no_engine_can_resume_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    host = {"deploy": {"hosts": {"big": {}}}, "connections": ()}
+    config = kept(tmp_path, instances={"gain": {"fmu": "Gain", "host": "big"}}, **host)
+    text = "`recovery.directory` of mesh 'pair' has no effect where an engine starts its processes."
+
+    for engine in ("slurm", "compose", "kubernetes"):
+        assert refused(capsys, "render", engine, config, "--insecure").startswith(text)
+    none = "recovery.directory=null"
+    assert refused(capsys, "render", "slurm", config, "--insecure", "--set-config", none, "--resume").startswith(
+        "the job of mesh 'pair' cannot be resumed: it keeps nothing."
+    )
+    assert refused(capsys, "render", "compose", config, "--resume") == "`render compose` takes no --resume"
+
+
 def test_nobody_is_let_in_who_was_not_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = write_config(tmp_path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,11 +15,13 @@ import pytest
 
 from fmu_mesh.cli.main import main
 from fmu_mesh.errors import FmuMeshError, MeshLost, from_report
-from fmu_mesh.hosts import slurm
-from fmu_mesh.hosts.slurm import MeshScript, SlurmJob, followed
+from fmu_mesh.hosts import slurm_mesh
+from fmu_mesh.hosts.slurm import SlurmJob
+from fmu_mesh.hosts.slurm_mesh import MeshScript, followed
 from fmu_mesh.run.events import Event, EventWriter
 from fmu_mesh.run.outcome import Outcome
 from tests.helpers import DEADLINE_S, Launched, Place, row_count, wait_until, write_config
+from tests.pages.blocks import blocks_of
 from tests.sweeps.slurm_cluster import SlurmCluster, missing
 
 needs_slurm = pytest.mark.skipif(missing() is not None, reason=str(missing()))
@@ -36,8 +39,8 @@ def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fake:
     """No program of Slurm is on the path but those that the test makes: its name, and what it does in a shell."""
     (programs := tmp_path / "programs").mkdir()
     monkeypatch.setenv("PATH", str(programs))
-    monkeypatch.setattr(slurm, "_LOOK_S", 0.01)
-    monkeypatch.setattr(slurm, "_POLL_S", 0.02)
+    monkeypatch.setattr(slurm_mesh, "_LOOK_S", 0.01)
+    monkeypatch.setattr(slurm_mesh, "_POLL_S", 0.02)
 
     def make(name: str, text: str) -> None:
         (programs / name).write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
@@ -81,6 +84,32 @@ def test_a_job_is_followed_to_its_outcome(fake: Fake, job: SlurmJob) -> None:
 
     assert followed(job, SCRIPT, shown.append) == DONE
     assert shown == [DONE]
+
+
+def test_a_job_that_is_queued_again_has_no_outcome_yet(fake: Fake, job: SlurmJob, tmp_path: Path) -> None:
+    has_events(job, LOST)
+    file = job.script.with_name("events.jsonl")
+    file.rename(tmp_path / "lost")
+    has_events(job, DONE)
+    file.rename(tmp_path / "done")
+    (tmp_path / "lost").rename(file)
+    line = f"read -r line <'{tmp_path}/done'; echo \"$line\" >>'{file}'"
+    fake("squeue", f"echo 'PENDING|BeginTime'; if test -e '{tmp_path}/asked'; then {line}; fi; : >'{tmp_path}/asked'")
+    shown: list[Event] = []
+    said: list[str] = []
+
+    assert followed(job, SCRIPT, shown.append, said.append) == DONE
+    assert (shown, said) == ([DONE], ["job 17 of Slurm waits: BeginTime"])
+
+
+def test_a_job_that_cannot_go_on_is_no_earlier_loss(fake: Fake, job: SlurmJob, tmp_path: Path) -> None:
+    has_events(job, LOST)
+    asked = f"test -e '{tmp_path}/asked'"
+    fake("squeue", f"if {asked}; then echo FAILED; else echo 'PENDING|None'; : >'{tmp_path}/asked'; fi")
+    job.log().write_text("fmu-mesh: the run in 'kept' cannot be resumed\n", encoding="utf-8")
+
+    with pytest.raises(MeshLost, match=r"has not told how.*the run in 'kept' cannot be resumed"):
+        followed(job, SCRIPT, lambda _event: None)
 
 
 def test_half_a_line_is_read_when_it_is_whole(fake: Fake, job: SlurmJob, tmp_path: Path) -> None:
@@ -155,7 +184,7 @@ def test_a_job_whose_master_says_nothing_ends_with_the_words_of_slurm(fake: Fake
 
 def test_a_slurm_that_says_nothing_has_a_deadline(fake: Fake, job: SlurmJob, monkeypatch: pytest.MonkeyPatch) -> None:
     fake("squeue", "echo 'Unable to contact slurm controller' >&2; exit 1")
-    monkeypatch.setattr(slurm, "_SILENCE_S", 0.5)
+    monkeypatch.setattr(slurm_mesh, "_SILENCE_S", 0.5)
 
     with pytest.raises(MeshLost, match=r"Slurm has not told the state of job 17 for 0\.5 s"):
         followed(job, SCRIPT, lambda _event: None)
@@ -283,6 +312,73 @@ def test_ctrl_c_leaves_the_job_and_scancel_ends_it(shared: Place, running: Slurm
     assert code == 130
     assert f"job {job} of Slurm goes on. `scancel {job}` ends it." in submitting.errors
     wait_until(lambda: not shared.processes(), "the end of all processes", DEADLINE_S)
+
+
+def kept_job(place: Place, name: str) -> Path:
+    """The configuration of a job of ten seconds that can go on; `local.csv` beside it is its result in one process."""
+    recovery, pace = {"directory": "kept"}, {"real_time_factor": 2.0}
+    config = write_config(place.folder, name=name, stop_time=20.0, simulation=pace, recovery=recovery)
+    alone = ["--set-config", "recovery.directory=null", "--real-time-factor", "0"]
+    local = place.run("launch", config, "--local", *alone, "--output", "local.csv")
+    assert local.wait() == 0, local.story()
+    return config
+
+
+def queue_again(cluster: SlurmCluster, config: Path) -> None:
+    """As soon as the only job has a checkpoint and rows, end it as the administrator of a cluster does."""
+    wait_until(lambda: row_count(config.with_suffix(".csv")) > 0, "rows")
+    wait_until(lambda: [*config.with_name("kept").glob("*.state")], "a checkpoint")
+    [job] = cluster.jobs()
+    cluster.ask("scontrol", "requeue", job)
+    wait_until(lambda: "PENDING" in cluster.ask("squeue", "--noheader", "--format=%T"), "the job in the queue")
+    # Slurm waits for two minutes. In the second of its end, a host refuses it: "job credential revoked".
+    cluster.ask("scontrol", "update", f"JobId={job}", "StartTime=now+3")
+
+
+@needs_slurm
+def test_a_job_that_slurm_queues_again_equals_one_process(shared: Place, running: SlurmCluster) -> None:
+    config = kept_job(shared, "pair")
+    job = shared.start("submit", "slurm", config, "--slurm-option=--cpus-per-task=2")  # the hosts have no third one
+
+    queue_again(running, config)
+
+    assert job.wait() == 0, shared.story()
+    assert "the run is resumed, and goes on from point" in job.errors
+    assert config.with_suffix(".csv").read_bytes() == (shared.folder / "local.csv").read_bytes()
+    assert list(shared.folder.glob("*slurm*")) == []
+
+
+@needs_slurm
+def test_a_new_job_goes_on_where_it_is_told_to(shared: Place) -> None:
+    config, option = kept_job(shared, "pair"), "--slurm-option=--cpus-per-task=2"
+    launched = shared.start("launch", config)
+    wait_until(lambda: [*config.with_name("kept").glob("*.state")], "a checkpoint")
+    launched.signal(signal.SIGINT)
+    launched.wait()
+
+    plain = shared.run("submit", "slurm", config, option)
+    resumed = shared.run("submit", "slurm", config, option, "--resume", "--real-time-factor", "0")
+
+    assert (plain.wait(), resumed.wait()) == (2, 0), shared.story()
+    assert "has a run of mesh 'pair' that has not ended. Go on with it with `--resume`" in plain.errors
+    assert config.with_suffix(".csv").read_bytes() == (shared.folder / "local.csv").read_bytes()
+
+
+@needs_slurm
+def test_the_script_of_the_page_goes_on_when_queued_again(shared: Place, running: SlurmCluster) -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "recovery.md"
+    [text] = [block.text for block in blocks_of(page) if "SLURM_RESTART_COUNT" in block.text]
+    (script := shared.folder / "job.sbatch").write_text(text, encoding="utf-8")
+    config = kept_job(shared, "plant")
+    programs = f"{Path(sys.executable).parent}:{running.environment['PATH']}"
+    running.ask("sbatch", f"--chdir={shared.folder}", f"--export=ALL,PATH={programs}", str(script))
+
+    queue_again(running, config)
+
+    wait_until(lambda: not running.jobs(), "the end of the job", DEADLINE_S)
+    said = next(shared.folder.glob("slurm-*.out")).read_text(encoding="utf-8")
+    assert "the run is resumed, and goes on from point" in said
+    assert config.with_suffix(".csv").read_bytes() == (shared.folder / "local.csv").read_bytes(), said
 
 
 @needs_slurm

@@ -454,6 +454,11 @@ NOT_RUN = [
     ),
     (
         "docs/recovery.md",
+        "#!/bin/sh",
+        "it needs a Slurm cluster; tests/hosts/test_slurm_mesh.py runs it, and queues it again",
+    ),
+    (
+        "docs/recovery.md",
         "fmu-mesh checkpoint plant --output at20s.state",
         "the mesh is yours; tests/property/test_branches.py does it with others",
     ),

@@ -263,6 +263,7 @@ SPELLS_FLAGS = {
     "run/options.py": "it says how the command line spells them",
     "hosts/processes.py": "commands that an engine runs",
     "hosts/slurm.py": "options of sbatch",
+    "hosts/slurm_mesh.py": "options of sbatch, and of a command that a job runs",
     "sweeps/sweep_options.py": "as `run/options.py`",
     "sweeps/slurm_array.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
