@@ -31,6 +31,7 @@ __all__ = [
     "short_number",
     "short_path",
     "shown",
+    "walk",
     "with_article",
 ]
 
@@ -104,6 +105,12 @@ def listed(names: Sequence[str], *, nothing: str = "none") -> str:
         return nothing
     rest = len(names) - _LISTED_NAMES
     return ", ".join(names[:_LISTED_NAMES]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def walk(names: Sequence[str], most: int = _LISTED_NAMES) -> str:
+    """Names in the order in which one leads to the next, such as `a.y -> b.y and 3 more`."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return " -> ".join(names[:most]) + more
 
 
 def counted(number: int, what: str) -> str:

@@ -114,7 +114,7 @@ class ConnectionConfig(Base, frozen=True, kw_only=True, tag_field=KIND, tag="con
 
 
 class InitializationConfig(Base, frozen=True, kw_only=True):
-    """How algebraic loops in Initialization Mode are solved: fixed-point iteration with under-relaxation."""
+    """How algebraic loops in Initialization Mode are solved: by substitution, and where it is slow, by secant steps."""
 
     tolerance: Annotated[
         float,
@@ -129,8 +129,8 @@ class InitializationConfig(Base, frozen=True, kw_only=True):
         Meta(
             gt=0,
             le=1,
-            description="Fraction of the difference between an input and its source that one iteration removes. "
-            "Lower it for a loop that does not converge.",
+            description="Below 1: each iteration removes this fraction of the difference between an input and its "
+            "source, and there are no secant steps. For a loop that does not converge with them.",
         ),
     ] = 1.0
     iterations: Annotated[int, Meta(ge=1, description="Largest number of iterations; beyond it, the run fails.")] = 1000

@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -41,7 +41,7 @@ from ..wire.values import (
     json_encoding,
     who_sent,
 )
-from ..wire.views import AuditEntry, ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
+from ..wire.views import AuditEntry, ConnectionView, InstanceInfo, LogLine, SetAnswer, SolvedLoop, VariableView, Way
 from ..wire.ways import Ways
 from .activity import Activity
 from .inputs import set_input
@@ -127,7 +127,7 @@ class Answers:
             return
         views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
         if runner is not None:
-            views["info"] = lambda: instance_info(self._plan, runner, self._activity.ways)
+            views["info"] = lambda: instance_info(self._plan, runner, self._activity.ways, self._activity.loops)
         for what, view in views.items():
             if query.key_expr.intersects(zenoh.KeyExpr(f"{root}/{what}")):
                 query.reply(f"{root}/{what}", msgspec.json.encode(view()), encoding=json_encoding)
@@ -373,7 +373,7 @@ class _Pending:
         self.finish(partial(self.query.reply_err, reason))
 
 
-def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> InstanceInfo:
+def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None, loops: Sequence[SolvedLoop]) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
     sources, timeouts = runner.plan.sources, {own.variable: str(own) for own in runner.plan.timeouts}
@@ -439,4 +439,5 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
         clocks=description.clocks,
         keys=key_views(runner.name, *runner.plan.keys_in, *runner.plan.keys_out),
         deploy_host=plan.host or "",
+        loops=tuple(own for own in loops if any(name.startswith(f"{runner.name}.") for name in own.outputs)),
     )

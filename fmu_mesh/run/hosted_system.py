@@ -64,6 +64,7 @@ class HostedSystem:
     Attributes:
         plan: the plan.
         runners: the instances, by name.
+        initialization: what it has found, once `begin` has returned.
         loads: whether the next `open` opens instances, and does not use those that are there.
     """
 
@@ -93,7 +94,7 @@ class HostedSystem:
         self._state: ProcessState | None = None
         self._begins_with = begins_with or BeginsWith()
         self._begins_again, self._names = begins_with is None, ", ".join(plan.order)
-        self._initialization = Initialization(node)
+        self.initialization = Initialization(node)
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -130,7 +131,7 @@ class HostedSystem:
         """
         node, engine = self.node, self._engine
         begins, again = self._begins_with, engine is not None
-        self._initialization.run(self.runners.values(), start_values, again=again, begins_with=begins)
+        self.initialization.run(self.runners.values(), start_values, again=again, begins_with=begins)
         load_states(begins, self.runners)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point

@@ -27,6 +27,7 @@ from ..instances.registry import check_showing, claims, content, describe, expec
 from ..results.formats import check_record, warn_of_endings
 from ..results.keys_file import KEYS_ENDING, keys_beside, recorded_keys
 from ..ros_wire.key_messages import check_messages
+from ..system.initialization_plan import warn_of_start_values
 from ..system.plan import Plan, make_plan
 from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
@@ -194,6 +195,7 @@ def planned(
     contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
+    warn_of_start_values(system, plan.initialization.loops, warnings)
     warn_of_point_loops(plan, warnings)
     plan = replace(plan, system=replace(plan.system, warnings=(*system.warnings, *warnings), topics=topics))
     run = RunPlan(

@@ -20,7 +20,7 @@ from ..variables.value_types import PlainValue, Value, VariableType, nested, zer
 from .graph import reaches, strongly_connected
 from .system import Connection, ResolvedSystem
 
-__all__ = ["InitializationPlan", "Loop", "Tear", "check_loops", "plan_initialization"]
+__all__ = ["InitializationPlan", "Loop", "Tear", "check_loops", "plan_initialization", "warn_of_start_values"]
 
 Key = tuple[str, str]
 
@@ -135,6 +135,20 @@ def check_loops(
             wrong = True
     if wrong:
         findings.raise_any()
+
+
+def warn_of_start_values(system: ResolvedSystem, loops: Sequence[Loop], findings: Findings) -> None:
+    """Add a warning for each start value without effect: a connection gives the variable its value.
+
+    The iteration of a loop begins with some. FMI 1.0 computes outputs with them, before there are values to transfer.
+    """
+    torn = {(tear.target, tear.input) for loop in loops for tear in loop.tears}
+    for c in system.connections:
+        target, name = c.target_instance, c.target_name
+        is_early = not c.initial_only and system.instances[target].description.fmi_version.startswith("1")
+        if name in system.config.instances[target].start_values and (target, name) not in torn and not is_early:
+            found = f"a start value for '{name}', which gets its value from the connection {c} ({c.path})"
+            findings.add(f"instances.{target}.start_values.{name}", f"{found}: it has no effect", "")
 
 
 def _torn(

@@ -225,7 +225,6 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     warnings = loaded.findings()
     forbidden_start_values(config, descriptions, warnings, strict=False)
     unit_warnings(connections, descriptions, warnings)
-    _replaced_start_values(config, connections, warnings)
     warnings.merge(prescribed.warnings)
     _doubts(config, descriptions, warnings)
     record_warnings(loaded, variables, records, warnings)
@@ -425,14 +424,6 @@ def _doubts(config: Config, descriptions: Mapping[str, ModelDescription], findin
         if silent:
             found = f"triggered input clocks of '{name}' never tick, because clocks cannot be connected yet"
             findings.add(place, f"{found}: {listed(silent)}", "")
-
-
-def _replaced_start_values(config: Config, connections: Iterable[Connection], findings: Findings) -> None:
-    """Note which start values have no effect because a connection gives the parameter its value."""
-    for c in connections:
-        if c.initial_only and c.target.name in config.instances[c.target_instance].start_values:
-            found = f"a start value for '{c.target.name}', which gets its value from the connection {c} ({c.path})"
-            findings.add(f"instances.{c.target_instance}.start_values.{c.target.name}", found, "")
 
 
 def _check_zenoh(loaded: LoadedConfig, findings: Findings) -> Findings:

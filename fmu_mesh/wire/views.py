@@ -11,7 +11,7 @@ from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
-from ..text import counted
+from ..text import counted, walk
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
 
@@ -34,6 +34,7 @@ __all__ = [
     "RosTopicView",
     "RosView",
     "SetAnswer",
+    "SolvedLoop",
     "VariableView",
     "Way",
 ]
@@ -133,11 +134,30 @@ class KeyStatus(KeyView, frozen=True):
         return ", ".join([f"{self.rate:.3g}/s", *counts, *silent])
 
 
+class SolvedLoop(msgspec.Struct, frozen=True):
+    """How an algebraic loop was solved at the start.
+
+    Attributes:
+        outputs: its outputs, as `instance.output`, in the order in which they are computed.
+        residual: the largest difference that is left between a floating-point value and its source, as a fraction of
+            the value if that is above 1.
+    """
+
+    outputs: tuple[str, ...]
+    iterations: int
+    residual: float
+
+    def __str__(self) -> str:
+        after = counted(self.iterations, "iteration")
+        return f"{walk(self.outputs)} solved after {after}, residual {self.residual:.2g}"
+
+
 class InstanceInfo(msgspec.Struct, frozen=True):
     """Answer of `…/<instance>/info`.
 
     Attributes:
         host: the name that the system has; ``deploy_host``: the one in `deploy.hosts`, empty where `launch` runs.
+        loops: how the algebraic loops with outputs of this instance were solved at the start.
     """
 
     instance: str
@@ -159,6 +179,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     clocks: tuple[Clock, ...] = ()
     keys: tuple[KeyView, ...] = ()
     deploy_host: str = ""
+    loops: tuple[SolvedLoop, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.variables), 'variable')}, {counted(len(self.connections), 'connection')}"

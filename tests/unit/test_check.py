@@ -95,6 +95,7 @@ Recorded
   into results/loop.csv
 
 Warnings
+  mesh.yaml:8: instances.outer.start_values.u: a start value for 'u', which gets its value from the connection inner.y -> outer.u (connections[4]): it has no effect
   mesh.yaml:11: connections[1]: a loop at every point: sum.y -> loop.u, loop.y -> sum.u2. Each of these outputs depends directly on the input before it. The delay of 1 at loop.y -> sum.u2 makes this a fixed-point iteration in time, one sweep per point, which may be unstable: compare with a smaller step size, or solve it by `loops: solved` in `simulation`
 
 OK: mesh.yaml can run.
