@@ -91,7 +91,7 @@ def _set(_: Path) -> dict[str, Any]:
     }
 
 
-def consistent_loop(gain: float = -0.5, **simulation: object) -> dict[str, Any]:
+def consistent_loop(gain: float = -2.0, **simulation: object) -> dict[str, Any]:
     """A loop of direct dependencies over two FMUs, which a pendulum drives, and an instance behind it."""
     usual = {"stop_time": 2.0, "step_size": 0.001, "loops": "solved", "extrapolation": "midpoint"}
     return {

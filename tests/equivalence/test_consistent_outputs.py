@@ -126,7 +126,7 @@ def test_recorded_outputs_of_a_loop_fit_together_at_each_point(tmp_path: Path) -
 
     both = result["pendulum.a"] + result["gain.y"] + 0.5
     assert np.abs(result["sum.y"] - both).max() < 1e-15  # a few roundings of numbers around 1
-    assert np.abs(result["gain.y"] + 0.5 * result["sum.y"]).max() < 1e-15
+    assert np.abs(result["gain.y"] + 2.0 * result["sum.y"]).max() < 1e-15
 
 
 def test_a_run_that_begins_with_a_state_goes_on_with_its_lines(tmp_path: Path) -> None:
