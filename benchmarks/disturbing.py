@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 import psutil
@@ -267,7 +268,7 @@ def _started(place: Place, mesh: Mesh, options: Sequence[str], most_s: float) ->
         mesh.config.with_name(name).unlink(missing_ok=True)
     file = mesh.config.with_name(mesh.files[0]) if mesh.files else place.folder / "result.csv"
     output = [] if mesh.files else ["--output", str(file)]
-    command = ["launch", mesh.config, "--no-progress", *output, *options]
+    command: list[str | Path] = ["launch", mesh.config, "--no-progress", *output, *options]
 
     def again() -> Launched:
         """Where there is nothing to resume, it was killed before its beginning, or after its end."""

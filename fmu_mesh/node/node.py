@@ -99,8 +99,7 @@ log = logging.getLogger(__name__)
 # Whatever a node sleeps for, after this time it looks at everything again: a wake-up that a killed process has lost
 # costs this much once (docs/rings.md), and silence of the master is noticed in steps that `AwakeClock` can count.
 _LONGEST_SLEEP_S = 0.5
-_TELL_S = 0.1
-_LAST_WORD_S = 0.3
+_TELL_S, _LAST_WORD_S = 0.1, 0.3
 _NO_MASTER_S = 1.0
 """How long in s the report of a failure waits for a master that was never seen."""
 
@@ -383,14 +382,14 @@ class Node:
         eager = any(link.has_frames for runner in self._runners.values() for link in runner.out_links)
         if self._profiler is not None:
             self._profiler.start(engine)
-        quiet = not eager and self._profiler is None and self._ways.way(self._plan.node, MASTER) != "zenoh"
+        is_quiet = not eager and self._profiler is None and self._ways.way(self._plan.node, MASTER) != "zenoh"
         left_s = 0.0
         while not self.finished:
             try:
-                has_more, saves = self._inbox.is_direct or self._inbox.has_posted, self._saves_at >= 0
+                saves, has_more = self._saves_at >= 0, self._inbox.is_direct or self._inbox.has_posted
                 wait_s = 0.0 if has_more else left_s if eager else _LONGEST_SLEEP_S
-                unseen = quiet and not saves and self.server.is_unfollowed  # else it sleeps on, also if it is eager
-                stepped = engine.run(wait_s, eager=eager or saves, quiet=unseen)
+                quiet = is_quiet and not saves and self.server.is_unfollowed  # it sleeps then, even if it is eager
+                stepped = engine.run(wait_s, eager=eager or saves, quiet=quiet)
             except (TerminationRequested, NotFinite) as asked:
                 stepped = True
                 self._end_early(engine, asked)

@@ -218,7 +218,7 @@ def test_a_component_that_reads_the_clock_is_named(place: Place) -> None:
     before = result.read_bytes()
 
     assert launched.wait() == 3, launched.story()
-    assert "'slow' is not deterministic: point 1, slow.y was" in launched.errors
+    assert re.search(r"'slow' is not deterministic: point \d+, slow\.y was", launched.errors)  # after a checkpoint
     assert result.read_bytes() == before
     assert rows_of(result)
 
