@@ -195,7 +195,7 @@ class RecordFiles:
     def _keep(self, write: Callable[[], str | None]) -> None:
         first = self._files[0].file.path
         try:
-            name = self._write_to(keys_beside(first), write)
+            name = self.write_to(keys_beside(first), write)
         except OSError as error:
             raise unwritable(keys_beside(first), error) from error
         if name is not None:
@@ -210,14 +210,15 @@ class RecordFiles:
         """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
         if self._keys is not None:
             self._keys.close()
-        self._raise_first([(own, self._write_to(own.file.path, own.close)) for own in self._files])
+        self._raise_first([(own, self.write_to(own.file.path, own.close)) for own in self._files])
 
     def _each(self, call: Callable[[_RecordFile], None]) -> None:
         """Do something with each file that can be written; then raise the first error."""
-        if any(errors := [self._write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
+        if any(errors := [self.write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
             self._raise_first([*zip(self._files, errors, strict=True)])
 
-    def _write_to(self, path: Path, call: Callable[[], Result]) -> Result:
+    def write_to(self, path: Path, call: Callable[[], Result]) -> Result:
+        """Write or close something, which `writing` tells meanwhile; returns what ``call`` returns."""
         self.writing = (path,)
         try:
             return call()

@@ -298,7 +298,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 table=table_of(own),
                 as_file=lambda point, states: state_bytes(runs.run, point, states),
                 checkpoint_s=run.checkpoint_s,
-                keep=keeper(run),
+                keep=keeper(run, runs.played),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
@@ -343,6 +343,7 @@ class _MasterRuns:
         session: of this process.
         run: the plan of the newest.
         resets: how often the mesh was reset.
+        played: gets the rows for a restart, before the mesh is reset; None: no node plays any.
         wiring: of its session.
     """
 
@@ -350,6 +351,7 @@ class _MasterRuns:
         self.session = open_session(wiring)
         process.stack.callback(close_session, self.session)
         self.run = self._first = run
+        self.played = run.played_rows()
         self.resets = 0
         self._process = process
         self.wiring = wiring
@@ -407,7 +409,8 @@ class _MasterRuns:
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
             audit=lambda: (master.audit.changes, master.audit.view()),
-            **({"on_flush": Syncing(self.run).flushed} if self.run.directory and not self.resets else {}),
+            played=self.played if not self.resets else None,
+            **({"on_flush": Syncing(self.run, self.played).flushed} if self.run.directory and not self.resets else {}),
         )
         if streams is not None:
             streams.tell_last(recorder.note_last)

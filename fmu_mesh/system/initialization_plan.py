@@ -20,7 +20,7 @@ from ..variables.value_types import PlainValue, Value, VariableType, nested, zer
 from .graph import reaches, strongly_connected
 from .system import Connection, ResolvedSystem
 
-__all__ = ["InitializationPlan", "Loop", "Tear", "check_loops", "plan_initialization"]
+__all__ = ["InitializationPlan", "Loop", "Tear", "check_loops", "needed_initially", "plan_initialization"]
 
 Key = tuple[str, str]
 
@@ -243,3 +243,24 @@ def _by_depth(vertices: Sequence[Key], edges: Sequence[tuple[Key, Key]]) -> list
 
 def _source(connection: Connection) -> Key:
     return connection.source_instance, connection.source.name
+
+
+def needed_initially(
+    system: ResolvedSystem,
+    connections: Sequence[Connection],
+    plan: InitializationPlan,
+    needed: Mapping[tuple[str, str], set[str]],
+) -> dict[tuple[str, str], set[str]]:
+    """What a node needs for parameters or to iterate a loop and no other link has (``needed``), by (instance, node)."""
+    initial, nodes = dict[tuple[str, str], set[str]](), {name: own.node for name, own in system.instances.items()}
+    for c in connections:
+        own = c.source_instance, nodes[c.target_instance]
+        if c.initial_only and own[1] != nodes[c.source_instance] and c.source.name not in needed.get(own, ()):
+            initial.setdefault(own, set()).add(c.source.name)
+    for loop in plan.loops:
+        for node in loop.nodes:
+            for tear in loop.tears:
+                output = system.base_of(tear.source, tear.output)
+                if node != nodes[tear.source] and output not in needed.get((tear.source, node), ()):
+                    initial.setdefault((tear.source, node), set()).add(output)
+    return initial

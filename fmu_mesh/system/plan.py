@@ -25,12 +25,13 @@ from .attempt import Attempt
 from .digest import digest_of
 from .execution_order import execution_order
 from .feeds import Feed, feeds_of
-from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
+from .initialization_plan import InitializationPlan, Loop, check_loops, needed_initially, plan_initialization
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
 from .linear_inputs import LinearInput
 from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
+from .played_nodes import keeps_states, played_nodes
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
 from .start_values import why_not_settable
@@ -142,6 +143,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder; ``secured``: whether those who set values have names.
         process: what its process may take; ``host``: the host that it runs on; None: that of `launch`.
+        saves: whether the states of its instances belong to a checkpoint for a restart.
     """
 
     mesh: str
@@ -170,6 +172,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     secured: bool = False
     process: ProcessConfig = ProcessConfig()
     host: str | None = None
+    saves: bool = True
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -210,6 +213,7 @@ class Plan(msgspec.Struct, frozen=True):
         cycles: instance names of every cycle.
         closing: the connections that have a delay of 1 because they close a cycle.
         nodes: by node name, with the recorder if there is one.
+        played: the nodes whose rows are kept for a restart, because others have no state.
     """
 
     system: ResolvedSystem
@@ -221,6 +225,7 @@ class Plan(msgspec.Struct, frozen=True):
     window: int
     digest: str
     nodes: dict[str, NodePlan]
+    played: tuple[str, ...] = ()
 
     @property
     def grid(self) -> TimeGrid:
@@ -232,6 +237,11 @@ class Plan(msgspec.Struct, frozen=True):
         """The hosts that nodes run on, besides the one of `launch`, by name."""
         named = {node.host for node in self.nodes.values()}
         return {name: host for name, host in self.system.config.deploy.hosts.items() if name in named}
+
+    @property
+    def outputs(self) -> dict[str, Layout]:
+        """The columns of the rows of each instance."""
+        return {item.name: item.outputs for node in self.nodes.values() for item in node.instances}
 
     def node_of(self, instance: str) -> str:
         """The name of the node of an instance."""
@@ -259,7 +269,8 @@ def make_plan(
     check_loops(initialization, connections, {n: own.description for n, own in system.instances.items()}, findings)
     outputs = system.output_layouts(connections)
     points = window_of(system.config.simulation.window if window is None else window, outputs.values())
-    plan = Plan(system, connections, order, cycles, closing, initialization, window=points, digest="", nodes={})
+    played = played_nodes(system, outputs).names if keeps_states(system.config.recovery) else ()
+    plan = Plan(system, connections, order, cycles, closing, initialization, points, "", {}, played)
     nodes = _nodes(plan, outputs)
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
@@ -292,10 +303,10 @@ def _digest(system: ResolvedSystem, nodes: dict[str, NodePlan], contents: Mappin
 
 def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
     system, config = plan.system, plan.system.config
-    links = _links(plan)
+    links = _links(plan, outputs)
     recorded = {link.source for link in links if link.target_node == RECORDER}
     windows = dict.fromkeys((instance.node for instance in system.instances.values()), plan.window)
-    if system.records:
+    if system.records or recorded:
         windows[RECORDER] = recorder_window(plan.window, [row_bytes(outputs[name]) for name in recorded])
     longest_step = max(instance.step_points for instance in system.instances.values())
     rings = {}
@@ -343,6 +354,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout]) -> dict[str, NodePlan]:
             secured=config.security is not None,
             process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
             host=config.deploy.known(config.instances[members[0]].host) if members else None,
+            saves=not plan.played or node in plan.played,
         )
     return nodes
 
@@ -399,7 +411,7 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
     )
 
 
-def _links(plan: Plan) -> tuple[Link, ...]:
+def _links(plan: Plan, outputs: Mapping[str, Layout]) -> tuple[Link, ...]:
     """One link per instance and other node that needs its outputs: to the recorder last, then the initial ones."""
     needed: dict[tuple[str, str], set[str]] = {}
     for c in plan.connections:
@@ -408,9 +420,12 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             needed.setdefault((c.source_instance, target_node), set()).add(c.source.name)
     for name, variable in plan.system.recorded:
         needed.setdefault((name, RECORDER), set()).add(plan.system.base_of(name, variable))
+    for name, layout in outputs.items():
+        if layout.columns and plan.node_of(name) in plan.played:
+            needed.setdefault((name, RECORDER), set()).update(layout.names)
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
-    initial = _needed_initially(plan, needed)
+    initial = needed_initially(plan.system, plan.connections, plan.initialization, needed)
     for index, (source, target_node) in enumerate([*ends, *sorted(initial)]):
         names = needed[source, target_node] if index < len(ends) else initial[source, target_node]
         instance = plan.system.instances[source]
@@ -431,20 +446,3 @@ def _links(plan: Plan) -> tuple[Link, ...]:
             )
         )
     return tuple(links)
-
-
-def _needed_initially(plan: Plan, needed: dict[tuple[str, str], set[str]]) -> dict[tuple[str, str], set[str]]:
-    """What a node needs for parameters or to iterate a loop and no other link has, by (instance, node)."""
-    initial: dict[tuple[str, str], set[str]] = {}
-    for c in plan.connections:
-        node = plan.node_of(c.target_instance)
-        own = c.source_instance, node
-        if c.initial_only and node != plan.node_of(c.source_instance) and c.source.name not in needed.get(own, ()):
-            initial.setdefault(own, set()).add(c.source.name)
-    for loop in plan.initialization.loops:
-        for node in loop.nodes:
-            for tear in loop.tears:
-                output = plan.system.base_of(tear.source, tear.output)
-                if node != plan.node_of(tear.source) and output not in needed.get((tear.source, node), ()):
-                    initial.setdefault((tear.source, node), set()).add(output)
-    return initial
