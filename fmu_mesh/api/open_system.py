@@ -32,7 +32,7 @@ from ..run.preparing import OtherStartValues
 from ..run.run_plan import RunPlan
 from ..run.state_file import StateFile, state_bytes, with_replaced, write_state
 from ..simtime import ENDLESS
-from ..system.states import stateless
+from ..system.played_nodes import stateless
 from ..text import listed, option_text, shown
 from ..variables.value_conversion import ValueRefused, checker
 from ..variables.value_types import DTYPES, PlainValue

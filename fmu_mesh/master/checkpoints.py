@@ -27,7 +27,7 @@ from ..errors import (
     MessageRefused,
     from_report,
 )
-from ..system.states import stateless
+from ..system.played_nodes import stateless
 from ..wire.messages import MAX_STATES_SIZE, InstanceState, decode_state
 from ..wire.refusals import Refusals
 from .master_states import MasterStates
@@ -64,7 +64,8 @@ class Checkpoints:
         self._mesh = f"mesh '{mesh}'"
         self._states = states
         self._withdraw, self._settings, self._refusals = withdraw, settings, refusals
-        self._every_s = settings.checkpoint_s if not stateless(states.plan.system) else None
+        self._every_s = settings.checkpoint_s
+        self._saving = {item.name for node in states.plan.nodes.values() if node.saves for item in node.instances}
         self._due_at = self._every_s if self._every_s is not None else math.inf
         self._now = 0.0
         self._waiting: list[tuple[zenoh.Query, float]] = []
@@ -75,6 +76,9 @@ class Checkpoints:
 
     def ask(self, query: zenoh.Query, wait_s: float, now: float) -> None:
         """Answer a query with the file of a checkpoint, or why there is none; in ``wait_s`` seconds, 0: in 5 s."""
+        for name, why in stateless(self._states.plan.system).items():  # a restart does without
+            self._answer(CallRefused(f"its state cannot be written to a file: {why}.", instance=name), [query])
+            return
         try:
             if self._states.saves_at is None:
                 self._begin()
@@ -83,8 +87,6 @@ class Checkpoints:
             self._answer(refused, [query])
 
     def _begin(self) -> None:
-        for name, why in stateless(self._states.plan.system).items():
-            raise CallRefused(f"its state cannot be written to a file: {why}.", instance=name)
         self._found.clear()
         self._came.clear()
         self._stands_since, states = None, self._states
@@ -125,7 +127,7 @@ class Checkpoints:
             return
         if self._stands_since is None and states.granting.reached >= at:
             self._stands_since = now
-        missing = states.plan.system.instances.keys() - found.keys()
+        missing = self._saving - found.keys()
         failed = [own.error for own in found.values() if own.error is not None]
         limit_s = states.deadlines.silence
         if not states.takes_commands or states.ended_by is not None:  # then nobody may come to that point
@@ -138,7 +140,10 @@ class Checkpoints:
             if self._every_s is not None:
                 took_s = now - (self._stands_since if self._stands_since is not None else now)
                 self._due_at = now + max(self._every_s, _LEAST_TIMES * took_s)
-            self._complete = at, {name: bytes(self._came.pop(name)) for name in states.plan.system.instances}
+            self._complete = (
+                at,
+                {name: bytes(self._came.pop(name)) for name in states.plan.system.instances if name in found},
+            )
         elif now - (self._stands_since if self._stands_since is not None else math.inf) > limit_s:
             nodes = sorted({states.plan.node_of(name) for name in missing})
             text = f"the states of {spoken(*nodes)} at point {at} have not come within {limit_s:g} s"

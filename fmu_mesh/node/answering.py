@@ -141,11 +141,12 @@ class Answers:
         if runner is None or not wanted:
             query.drop()
             return
-        if self._activity.state in _BEFORE_VALUES and now - pending.asked <= _ANSWER_S:
+        plays = runner.player is not None  # it has no values of its own before the point of its state
+        if (self._activity.state in _BEFORE_VALUES or plays) and now - pending.asked <= _ANSWER_S:
             self._early.append(pending)
             return
-        if self._activity.state != "running":
-            pending.refuse(f"'{name}' has no values now: {self._activity.state}")
+        if self._activity.state != "running" or plays:
+            pending.refuse(f"'{name}' has no values now: {'restarting' if plays else self._activity.state}")
             return
         known, step = self._from_rows(runner, wanted)
         self._reply_values(runner, query, known, step)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import chain
 from time import perf_counter
-from typing import cast
+from typing import Final, cast
 
 from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
 from ..instances.contract import StepsNatively
@@ -18,9 +20,12 @@ from ..rings.row_streams import RowStreams
 from ..system.plan import NodePlan
 from .engine import SLICE_S, STATE_CHECK_S, Engine, PlainEngine, Windows
 from .inputs import TimedInputs
-from .stepping import Runner
+from .stepping import RowPlayer, Runner
 
 __all__ = ["BurstEngine", "make_engine"]
+
+_PLAYED_TICKS: Final = 4096
+"""How many rows are played at once."""
 
 
 def make_engine(  # noqa: PLR0913  one node and how it is connected
@@ -195,11 +200,12 @@ class BurstEngine(Engine):
     def refit(self, runner: Runner) -> None:
         """Fill the table of a runner: at the start, and again whenever it steps in another way."""
         before, unit = runner.table, next(unit for unit in self.units if runner in unit)
-        own = runner.instance.native if isinstance(runner.instance, StepsNatively) else None
-        if own is not None and any(source.transfer.has_text for source in runner.sources):
+        sources = runner.sources if runner.player is None else ()  # what plays needs no rows of others
+        own = runner.instance.native if isinstance(runner.instance, StepsNatively) and not runner.player else None
+        if own is not None and any(source.transfer.has_text for source in sources):
             own = None
-        moves = [source.transfer.moves(RowBase.FIRST_GATE + number) for number, source in enumerate(runner.sources)]
-        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(runner.sources)))()
+        moves = [source.transfer.moves(RowBase.FIRST_GATE + number) for number, source in enumerate(sources)]
+        bases = (ctypes.c_void_p * (RowBase.FIRST_GATE + len(sources)))()
         grid, points = runner.grid, runner.plan.step_points
         watched = runner.watched if runner.watched is not None else runner.outputs
         rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
@@ -227,7 +233,7 @@ class BurstEngine(Engine):
             made.give(loads=own.loads, setters=own.setters, getters=own.getters, stores=own.stores)
             if own.lines is not None:
                 made.note(lines=ctypes.addressof(own.lines), lines_count=len(own.lines))
-        gates = [source.gate for source in runner.sources]
+        gates = [source.gate for source in sources]
         made.give(gates=gates, feeds=list(chain(*moves)), finite=runner.is_finite.spans)
         self._kept[runner.name] = [made, bases, own]  # what the table points to
         ctypes.pointer(before)[0] = made
@@ -236,6 +242,8 @@ class BurstEngine(Engine):
 
     def _step_of(self, runner: Runner) -> Callable[[int], None]:
         """How Python takes a step of a runner, whose inputs that are no texts are there."""
+        if runner.player is not None:
+            return partial(self._play, runner, runner.player)
         do_step, is_timed = runner.instance.do_step, isinstance(runner.instance, TimedInputs)
         may_fail = runner.plan.section.on_failure != "stop"
         texts = [source.transfer for source in runner.sources if source.transfer.has_text]
@@ -252,6 +260,26 @@ class BurstEngine(Engine):
                 self.follow_inputs(runner)
 
         return step_all
+
+    def _play(self, runner: Runner, player: RowPlayer, step: int) -> None:
+        """Play the rows of a unit as far as the burst may step now; the burst itself counts the last one.
+
+        It calls this for each member. Those before it in the unit have taken the step already.
+        """
+        number, unit = next((number, unit) for number, unit in enumerate(self.units) if runner in unit)
+        place, points = self._units[number], self.tick_points(unit)
+        place.note(burst=_PLAYED_TICKS if step < player.last else 1)
+        steps = [own.plan.step_points // points for own in unit]  # in ticks
+        end = min(-(-self._node.allowed // points), (player.last + 1) * runner.plan.step_points // points - 1)
+        end -= end % math.lcm(*steps)  # here each member has a row of its own
+        if end > place.tick:
+            for index, (own, ticks) in enumerate(zip(unit, steps, strict=True)):
+                assert own.player is not None  # no member is at its state before this point
+                own.player.read_to(row := end // ticks)
+                own.table.note(step=row - (index >= place.next))
+                own.counter.raise_to(own.step + 1)
+            place.note(tick=end - 1)
+        player.take(runner.step)
 
     def _look_at_failure(self, runner: Runner) -> None:
         """If an instance with native steps has failed and goes on with held outputs, Python takes its steps."""

@@ -313,10 +313,10 @@ class PlainEngine(Engine):
     def _step(self, place: native.UnitTable, runner: Runner) -> None:
         member, step = runner.table, runner.step
         try:
-            for source in runner.sources:
+            for source in runner.sources if runner.player is None else ():
                 source.transfer.step(step)
             member.stage = Stage.IN_PYTHON
-            runner.instance.do_step(step)
+            (runner.player.take if runner.player is not None else runner.instance.do_step)(step)
             if not runner.is_finite.check(step + 1):
                 runner.not_finite(step)
         except FmuMeshError as error:

@@ -310,7 +310,7 @@ class Node:
         self._activity.enter("initializing")
         plan = self._plan
         self._initialization.run(self._runners.values(), begins_with=self._begins_with)
-        load_states(self._begins_with, self._runners)
+        load_states(self._begins_with, self._runners, plan.attempt)
         units = [[self._runners[name] for name in names] for names in plan.units]
         self._engine = engine = self._make_engine(
             plan, units, self._memory, self._windows(), spins=not ONE_CORE, streams=self._streams
@@ -486,7 +486,7 @@ class Node:
         elif kind == FINISH:
             self._finish_at = point
         elif kind == SAVE:
-            self._send_states(point)
+            self._send_states(point if self._plan.saves else -1)
         elif kind == ABORT:
             raise _Aborted(from_report(decode_json(data[HEADER.size :], ErrorReport)))
         elif kind == RESET:

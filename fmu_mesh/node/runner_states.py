@@ -3,31 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from itertools import chain
-from typing import cast
+from pathlib import Path
+from typing import Final, cast
 
 from msgspec.structs import replace
 
 from ..errors import FmuError
 from ..instances.contract import KeepsState
+from ..results.played_rows import RowsToPlay
 from ..rings.packed_member import PackedMember, columns_of, put_columns
+from ..system.attempt import Attempt
 from ..system.states import BeginsWith
 from ..variables.value_conversion import to_value
 from ..wire.messages import InstanceState, encode_state
 from .inputs import TimedInputs, set_input
-from .stepping import Runner
+from .stepping import RowPlayer, Runner
 
 __all__ = ["load_states", "set_again", "state_messages"]
 
+_FIRST: Final = Attempt()
 
-def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner]) -> None:
+
+def load_states(begins_with: BeginsWith, runners: Mapping[str, Runner], attempt: Attempt = _FIRST) -> None:
     """After Initialization Mode, and before an engine is made: bring the runners to their states.
+
+    In an ``attempt`` that plays, they come to them later: until then, they play their rows.
 
     Raises:
         FmuError: an instance cannot use its state.
+        FmuMeshError: the rows cannot be read.
     """
+    rows = RowsToPlay(Path(attempt.rows)) if attempt.plays_to else None
     for name, data in begins_with.states.items():
-        _load(runners[name], data)
+        runner = runners[name]
+        if rows is not None:
+            load = partial(_load_later, runner, data, attempt.plays_to)
+            read, last = partial(rows.read, name, runner.outputs), attempt.plays_to // runner.plan.step_points - 1
+            runner.play(RowPlayer(read, last, load))
+            continue
+        runner.begin_at(runner.grid.first_point // runner.plan.step_points)
+        _load(runner, data, runner.grid.first_point)
     for name in begins_with.anew.keys() & runners.keys():
         if isinstance(timed := runners[name].instance, TimedInputs):
             timed.last.count_from(runners[name].step)
@@ -91,12 +108,17 @@ def _packed(runner: Runner) -> bytes:
     return replace(known, outputs=outputs, inputs=inputs).encoded()
 
 
-def _load(runner: Runner, data: bytes) -> None:
+def _load_later(runner: Runner, data: bytes, point: int) -> None:
+    runner.play(None)
+    _load(runner, data, point)
+    runner.refit()
+
+
+def _load(runner: Runner, data: bytes, point: int) -> None:
     own, grid, name = PackedMember.decoded(data, runner.name), runner.grid, runner.name
-    if (at := own.step * runner.plan.step_points) != grid.first_point:
-        raise FmuError(f"its state is of point {at}, and the run begins at point {grid.first_point}", instance=name)
-    runner.begin_at(own.step)
-    runner.bind()
+    if (at := own.step * runner.plan.step_points) != point:
+        raise FmuError(f"its state is of point {at}, and the run needs that of point {point}", instance=name)
+    runner.bind_at(own.step)
     if own.over_time and not isinstance(runner.instance, TimedInputs):
         timed = TimedInputs(runner.instance, "hold")
         timed.start(grid, runner.plan.step_points, own.step)
@@ -104,7 +126,7 @@ def _load(runner: Runner, data: bytes) -> None:
     instance = cast("KeepsState", runner.instance)
     together = runner.instance.together(own) if isinstance(runner.instance, TimedInputs) else own.state
     if isinstance(runner.instance, TimedInputs):
-        runner.instance.skip_before(grid.first_point)
+        runner.instance.skip_before(point)
     state = instance.deserialize_state(together)
     try:
         instance.set_state(state)

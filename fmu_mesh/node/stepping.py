@@ -6,7 +6,7 @@ that frames fill. It owns nothing about waiting. `fmu_mesh.node.engine` steps th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, Protocol, cast
 
@@ -27,7 +27,7 @@ from ..wire.frames import FrameReceiver, SourceRows, rows_of
 from ..wire.ways import Ways
 from .links import OutLink
 
-__all__ = ["Runner", "Source", "connect", "sources_of"]
+__all__ = ["RowPlayer", "Runner", "Source", "connect", "sources_of"]
 
 
 class Source(NamedTuple):
@@ -67,6 +67,34 @@ class Refitting(Protocol):
         ...
 
 
+class RowPlayer:
+    """Plays the rows of an instance up to the point of its state, and loads this in the place of the last step.
+
+    Nobody else can tell that from stepping: rows, counters and windows are the same, but no source is waited for.
+
+    Args:
+        rows: reads the rows of the instance into its ring, from one own step to before another.
+        last: the own step that ends at that point.
+        load: loads the state, with the row after that step; then the runner steps by itself.
+    """
+
+    def __init__(self, rows: Callable[[int, int], None], last: int, load: Callable[[], None]) -> None:
+        self._rows, self.last, self._load, self._read = rows, last, load, 0
+
+    def read_to(self, row: int) -> None:
+        """Have all rows up to this one in the ring; raises `FmuMeshError` if they cannot be read."""
+        if row > self._read:
+            self._rows(self._read + 1, row + 1)
+            self._read = row
+
+    def take(self, step: int) -> None:
+        """Have the row after own step ``step``, or load; the errors are those of both."""
+        if step == self.last:
+            self._load()
+        else:
+            self.read_to(step + 1)
+
+
 class Runner:
     """One instance with its row of inputs and its output ring.
 
@@ -74,6 +102,7 @@ class Runner:
         out_links: send its rows to those who do not read its ring.
         watched: a ring with further outputs, which somebody watches.
         table: how far it is, which whoever steps it writes, and for the burst how it is stepped.
+        player: takes its steps before the point of its state, if it plays; None: the instance takes them.
     """
 
     def __init__(  # noqa: PLR0913  an instance, and where its values are
@@ -95,6 +124,7 @@ class Runner:
         self.sources: list[Source] = []
         self.out_links: list[OutLink] = []
         self.watched: Ring | None = None
+        self.player: RowPlayer | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
         self.is_finite = FiniteRows(plan, outputs, self.inputs)
@@ -110,12 +140,18 @@ class Runner:
         """Bind the instance to its rows, and read the current outputs. Call after Initialization Mode.
 
         Between two steps, the row of the last one stays as it is: what was set since then belongs to the next row.
+        Nothing happens while it plays: the instance is at another point.
         """
+        if self.player is None:
+            self.bind_at(self.step)
+
+    def bind_at(self, step: int) -> None:
+        """As `bind`, for an instance that has taken so many own steps."""
         self._fill_unconnected()
         outputs = (self.outputs,) if self.watched is None else (self.outputs, self.watched)
-        slot = self.step & self.outputs.mask
-        row = [part[slot].copy() for part in self.outputs.parts] if self.outputs.has_row(self.step) else []
-        self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, self.step)
+        slot = step & self.outputs.mask
+        row = [part[slot].copy() for part in self.outputs.parts] if self.outputs.has_row(step) else []
+        self.instance.bind(self.inputs, outputs, self.grid, self.plan.step_points, step)
         for part, kept in zip(self.outputs.parts, row, strict=False):
             part[slot] = kept
         self.refit()
@@ -162,6 +198,10 @@ class Runner:
     def failed(self) -> str:
         """In words since when and why its outputs are held; empty: they are not."""
         return self.instance.failed if isinstance(self.instance, AroundInstance) else ""
+
+    def play(self, player: RowPlayer | None) -> None:
+        """Let its rows be played from the next step on; with None, the instance takes its steps."""
+        self.player = player
 
     def stop(self) -> None:
         """This instance takes no more steps: its outputs hold to the end."""
@@ -249,9 +289,9 @@ class Runner:
 
     @property
     def lacking(self) -> Iterator[Source]:
-        """The sources without the row for the next step."""
+        """The sources without the row for the next step; what is played needs none."""
         step = self.step
-        if step < self.last_step:
+        if step < self.last_step and self.player is None:
             yield from (source for source in self.sources if not source.has(step))
 
     @property

@@ -9,14 +9,15 @@ from ..config.findings import ValueOrigin
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
+from ..run.run_plan import why_no_checkpoints
 from ..system.linear_inputs import counted_ways
 from ..system.placement import two_trips
 from ..system.plan import RECORDER, Plan
+from ..system.played_nodes import keeps_states, played_nodes, stateless
 from ..system.process_sharing import automatic_nodes
 from ..system.records import RecordPlan
 from ..system.schedule import Course, Schedule
 from ..system.series_files import course_of
-from ..system.states import stateless
 from ..system.system import Connection, SystemInstance
 from ..system.value_map import map_text
 from ..text import listed, short_number, short_path, shown
@@ -45,7 +46,7 @@ def plan_page(plan: Plan, loaded: LoadedConfig | None = None) -> list[str]:
         ("Inputs that are not connected", _free_inputs(plan)),
         ("Timeouts", _timeouts(plan)),
         ("Initialization", _initialization(plan)),
-        ("State files", _states(plan)),
+        ("States", _states(plan)),
         ("Recorded", _recorded(plan)),
         ("Topics in ROS", table([own.cells for own in plan.system.topics], indent=2)),
         ("Warnings", _warnings(plan)),
@@ -276,12 +277,26 @@ def _initialization(plan: Plan) -> list[str]:
 
 
 def _states(plan: Plan) -> list[str]:
-    """Which instances have a state that outlives their process, and why others have none; nothing if all have one."""
-    if not (without := stateless(plan.system)):
-        return []
+    """Which instances have a state that outlives their process, and why others have none; nothing if all have one.
+
+    And with which point a restart begins, if it does not begin with a checkpoint, or not for all.
+    """
+    without = stateless(plan.system)
     able = [name for name in plan.system.instances if name not in without]
-    lines = [f"  {', '.join(able)}: can be written"] if able else []
-    return [*lines, *(f"  {name}: cannot be written: {why}" for name, why in without.items())]
+    lines = [f"  {', '.join(able)}: can be written"] if able and without else []
+    lines += (f"  {name}: cannot be written: {why}" for name, why in without.items())
+    if not keeps_states(plan.system.config.recovery):
+        return lines
+    if why := why_no_checkpoints(plan):
+        return [*lines, f"  after a loss, all is calculated again from the first point: {why}"]
+    played = played_nodes(plan.system, plan.outputs)
+    if played.names:
+        going = ", ".join(name for name in plan.system.instances if name not in played.again)
+        lines.append(
+            f"  after a loss, these go on from a checkpoint: {going}; {played.point_bytes:g} bytes a point are kept"
+        )
+    again = (f"  after a loss, all steps of {name} are taken again: {why}" for name, why in played.again.items())
+    return [*lines, *again]
 
 
 def _recorded(plan: Plan) -> list[str]:

@@ -13,7 +13,7 @@ from ..rings.library import why_no_library
 from ..system.input_timeouts import InputTimeout
 from ..system.placement import two_trips
 from ..system.plan import Plan
-from ..system.states import stateless
+from ..system.played_nodes import stateless
 from ..system.value_map import map_words
 from ..text import counted
 from ..variables.value_conversion import to_plain

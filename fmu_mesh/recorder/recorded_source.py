@@ -5,7 +5,7 @@ Used by the recorder, and by runs in one process. It waits for nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -57,6 +57,10 @@ class RecordedSource:
                     point=(low + int(wrong.argmax())) * self.link.step_points,
                     hint="Does another process write to the memory of this run?",
                 )
+
+    def memory(self, first: int, end: int) -> Iterator[memoryview]:
+        """The bytes of own rows ``first .. end - 1``, of a source without text."""
+        return (self._rings[0].memory(slots) for _, slots in self._rings[0].pieces(first, end))
 
     def column(self, variable: str) -> ReadColumn:
         """A function that returns the values of a variable at the points first to end - 1, without wrap-around."""

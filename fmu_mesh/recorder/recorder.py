@@ -36,6 +36,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -55,6 +56,7 @@ from ..errors import (
 )
 from ..files import Kept
 from ..results.growth import GrowthWatch
+from ..results.played_rows import MemoryOf, PlayedRows
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
@@ -129,6 +131,7 @@ class Recorder:
         memory: that of the master's process, if others exchange rows through it or through its row streams.
         mirror_of: where the rows of a link come to that has a row stream.
         audit: how often something has come from outside, and what, for the metadata.
+        played: gets the rows of the nodes that may have to play them.
         on_flush: called about five times a second, with what the operating system has of each file; its error ends the
             run.
 
@@ -150,6 +153,7 @@ class Recorder:
         mirror_of: Callable[[Link], SourceRows | None] = lambda _link: None,
         audit: Callable[[], tuple[int, object]] = lambda: (0, None),
         on_flush: Callable[[Sequence[Kept]], None] = lambda _kept: None,
+        played: PlayedRows | None = None,
     ) -> None:
         self._plan = plan
         self._mirror_of, self._audit, self._audited, self._audit_at = mirror_of, audit, 0, -math.inf
@@ -157,11 +161,12 @@ class Recorder:
         self._own_memory.begin_at(plan.grid.first_point, plan.rings)
         self._memory = memory if memory is not None else self._own_memory
         self._sources: dict[int, RecordedSource] = {}
+        self._rings: dict[str, MemoryOf] = {}
         self._rows = min(place.rows for place in plan.rings)
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
         self._files = RecordFiles(files, growth, notes)
-        self._wanted, self._on_flush = wanted, on_flush
+        self._wanted, self._on_flush, self._played = wanted, on_flush, played
         self._first = self._written = self._told = plan.grid.first_point
         self._flushed = 0.0
         self._finished = False
@@ -232,6 +237,8 @@ class Recorder:
                     self._files.note({"ended_by": error.message})
             finally:
                 self._files.close()
+                if self._played is not None:
+                    self._played.close()
         except BaseException as failure:  # noqa: BLE001  the thread of the master raises it
             last.set_exception(failure)
         else:
@@ -278,6 +285,7 @@ class Recorder:
             return False
         self._sources = {link.index: self._source(link, welcome.ways) for link in self._plan.links_in}
         by_name = {source.link.source: source for source in self._sources.values()}
+        self._rings = {name: source.memory for name, source in by_name.items()}
         self._files.begin(
             self._plan.grid, self._plan.records, lambda instance, variable: by_name[instance].column(variable)
         )
@@ -384,6 +392,8 @@ class Recorder:
             end = min(rows, first - first % self._rows + self._rows, first + _WRITE_ROWS)  # read without wrap-around
             self._check(first, end)
             self._files.write(first, end)
+            if self._played is not None:
+                self._files.write_to(self._played.path, partial(self._played.write, first, end, self._rings))
             self._check(first, end)
             self._written = end
 

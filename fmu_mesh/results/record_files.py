@@ -197,7 +197,7 @@ class RecordFiles:
     def _keep(self, write: Callable[[], str | None]) -> None:
         first = self._files[0].file.path
         try:
-            name = self._write_to(keys_beside(first), write)
+            name = self.write_to(keys_beside(first), write)
         except OSError as error:
             raise unwritable(keys_beside(first), error) from error
         if name is not None:
@@ -212,7 +212,7 @@ class RecordFiles:
         """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
         if self._keys is not None:
             self._keys.close()
-        self._raise_first([(own, self._write_to(own.file.path, own.close)) for own in self._files])
+        self._raise_first([(own, self.write_to(own.file.path, own.close)) for own in self._files])
 
     def check_writing(self, now: float, limit_s: float) -> None:
         """From another thread, at least twice a second: look whether each call returns in time; ``now`` is in s.
@@ -229,10 +229,11 @@ class RecordFiles:
 
     def _each(self, call: Callable[[_RecordFile], None]) -> None:
         """Do something with each file that can be written; then raise the first error."""
-        if any(errors := [self._write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
+        if any(errors := [self.write_to(own.file.path, partial(own.tried, call)) for own in self._files]):
             self._raise_first([*zip(self._files, errors, strict=True)])
 
-    def _write_to(self, path: Path, call: Callable[[], Result]) -> Result:
+    def write_to(self, path: Path, call: Callable[[], Result]) -> Result:
+        """Write or close something, which `check_writing` looks at; returns what ``call`` returns."""
         self._writing = (path,)
         try:
             return call()

@@ -100,6 +100,10 @@ class Ring:
             yield first, slice(slot, slot + size)
             first += size
 
+    def memory(self, slots: slice) -> memoryview:
+        """The bytes of the rows in neighbouring slots, each with its stamp; without text."""
+        return self._flat.data[slots.start * self.stride : slots.stop * self.stride]
+
     def part(self, type_: VariableType) -> NDArray[Any]:
         """The array of one type, of shape (rows, elements); it has no elements if no column has this type."""
         if type_ in self._types:

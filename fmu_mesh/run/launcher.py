@@ -37,6 +37,7 @@ from ..awake import AwakeClock
 from ..config.deadlines import Deadlines
 from ..errors import ConfigurationError, FmuMeshError, Interrupted, MeshLost
 from ..files import remove_tree
+from ..results.played_rows import PLAYED_ROWS
 from ..results.record_files import rows_left, what_is_kept
 from ..system.placement import manual_hosts, placed
 from ..system.plan import MASTER, RECORDER, NodePlan
@@ -195,7 +196,8 @@ class Launcher:
         """Remove what the processes of this attempt have left, but for their journals and the note about the mesh."""
         journals = [*self._folder.glob(f"**/*{JOURNAL}")]
         states = self._folder.glob(f"*{STATE}")
-        kept = {*journals, *states, *(file.parent for file in journals), self._folder / "mesh.json"}
+        kept = {*journals, *states, *(file.parent for file in journals)}
+        kept |= {self._folder / "mesh.json", self._folder / PLAYED_ROWS}
         boxes = [entry for entry in kept if entry.is_dir()]
         for entry in [entry for folder in {self._folder, *boxes} for entry in folder.iterdir()]:
             if entry not in kept:

@@ -20,7 +20,6 @@ from setproctitle import setproctitle
 
 from ..config.access_sections import is_socket
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, RunReset, StepFailed
-from ..files import Kept
 from ..instances.call_guard import CallWatch, Guarded
 from ..instances.contract import Instance, KeepsFiles, LogMessage, Opening
 from ..instances.registry import open_instance, prepare
@@ -48,9 +47,9 @@ from .limits import limit_process, strain
 from .one_process import is_other_python
 from .outcome import Outcome, last_recorded, outcome_at
 from .process import RunProcess
-from .run_directory import Syncing
+from .run_directory import on_flush
 from .run_plan import MANUAL, NodeRun, RunPlan, numbered, opening_in, read_node, read_run
-from .state_file import drop_older, keeper, state_bytes
+from .state_file import keeper, state_bytes
 from .wiring import certified, patient, shared_with_group, table_of, wiring
 
 if TYPE_CHECKING:  # most runs are never reset
@@ -299,7 +298,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 table=table_of(own),
                 as_file=lambda point, states: state_bytes(runs.run, point, states),
                 checkpoint_s=run.checkpoint_s,
-                keep=keeper(run),
+                keep=keeper(run, runs.played),
             )
             router = RouterLink(session, config.zenoh.connect)
             master = Master(plan, session, _Emitter(emit), settings, runs.replanned, router, runs.met())
@@ -344,6 +343,7 @@ class _MasterRuns:
         session: of this process.
         run: the plan of the newest.
         resets: how often the mesh was reset.
+        played: gets the rows for a restart, before the mesh is reset; None: no node plays any.
         wiring: of its session.
     """
 
@@ -351,6 +351,7 @@ class _MasterRuns:
         self.session = open_session(wiring)
         process.stack.callback(close_session, self.session)
         self.run = self._first = run
+        self.played = run.played_rows()
         self.resets = 0
         self._process = process
         self.wiring = wiring
@@ -408,17 +409,12 @@ class _MasterRuns:
             memory=master.memory_for(RECORDER),
             mirror_of=streams.mirror if streams is not None else lambda _link: None,
             audit=lambda: (master.audit.changes, master.audit.view()),
-            on_flush=self._on_flush(),
+            played=self.played if not self.resets else None,
+            on_flush=on_flush(self.run, self.played, self.resets),
         )
         if streams is not None:
             streams.tell_last(recorder.note_last)
         return recorder
-
-    def _on_flush(self) -> Callable[[Sequence[Kept]], None]:
-        run = self.run
-        if self.resets or not (run.directory or run.checkpoint_s is not None):
-            return lambda _kept: None
-        return Syncing(run).flushed if run.directory else partial(drop_older, run.kept_in, run.plan.system.records)
 
 
 def _opened_results(run: RunPlan) -> Sequence[ResultFile]:

@@ -22,7 +22,7 @@ import fcntl
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +35,7 @@ from ..config.loading import LoadedConfig
 from ..errors import ConfigurationError
 from ..files import Kept, is_file
 from ..results.formats import required_format
+from ..results.played_rows import PLAYED_ROWS, PlayedRows, cut_rows, rows_to_play
 from ..results.record_files import rows_after
 from ..system.digest import difference
 from ..system.records import IN_MEMORY
@@ -44,7 +45,7 @@ from .outcome import last_recorded
 from .run_plan import RunPlan
 from .state_file import STATE, again_from_checkpoint, drop_older
 
-__all__ = ["RunDirectory", "Syncing", "run_file"]
+__all__ = ["RunDirectory", "Syncing", "on_flush", "run_file"]
 
 _RUN: Final = "run"
 _ON_DISK: Final = "on_disk"
@@ -71,10 +72,14 @@ class _KeptRun(msgspec.Struct, frozen=True):
 
 
 class _OnDisk(msgspec.Struct, frozen=True):
-    """What survives a power cut: of each result file, and of each journal the bytes by its name."""
+    """What survives a power cut: of each result file, and of each journal the bytes by its name.
+
+    And the points of which rows can be played.
+    """
 
     files: tuple[Kept, ...]
     journals: dict[str, int]
+    played: int = 0
 
 
 def run_file(loaded: LoadedConfig) -> Path:
@@ -127,7 +132,8 @@ class RunDirectory:
         """
         ends = zip(map(_growing, self._records), rows, strict=True)
         try:
-            _sync(self._folder, self._records, [Kept(own, file.stat().st_size if own else 0) for file, own in ends])
+            kept = [Kept(own, file.stat().st_size if own else 0) for file, own in ends]
+            _sync(self._folder, self._records, kept, rows_to_play(self._folder / PLAYED_ROWS))
         except OSError as error:
             raise _unwritable(self._folder, error) from error
 
@@ -137,7 +143,7 @@ class RunDirectory:
             with suppress(OSError):
                 _give_to_disk(Path(file))
         states, journals = self._folder.glob(f"*{STATE}"), _journals(self._folder).glob(f"*{JOURNAL}")
-        for path in (self._folder / _RUN, self._folder / _ON_DISK, *states, *journals):
+        for path in (*(self._folder / name for name in (_RUN, _ON_DISK, PLAYED_ROWS)), *states, *journals):
             with suppress(OSError):
                 path.unlink()
 
@@ -187,6 +193,7 @@ class RunDirectory:
                 self.told.append(f"'{file}' had {own.rows} rows and has {rows}: the others are made again")
         seen = min(max(seen, last_recorded(plan.plan, found)), plan.plan.grid.last_point)
         self.told.append(f"the run is resumed, and goes on from point {seen}")
+        cut_rows(self._folder / PLAYED_ROWS, on_disk.played)
         all_rows = tuple(rows for _, rows in found)
         again = replace(plan, rows=all_rows, replays_to=seen)
         return again_from_checkpoint(again, self._folder, all_rows)
@@ -235,12 +242,20 @@ class RunDirectory:
             raise ConfigurationError(text, hint="End them, and resume it then.")
 
 
+def on_flush(run: RunPlan, played: PlayedRows | None, resets: int) -> Callable[[Sequence[Kept]], None]:
+    """What the recorder of a run calls with what the operating system has of each file, after so many resets."""
+    if resets or not (run.directory or run.checkpoint_s is not None):
+        return lambda _kept: None
+    if run.directory:
+        return Syncing(run, played).flushed
+    return lambda kept: drop_older(run.kept_in, run.plan, kept, played.points if played is not None else 0)
+
+
 class Syncing:
     """Gives the rows of a run with a directory, and its journals, to the disk: every few seconds, on its own thread."""
 
-    def __init__(self, run: RunPlan) -> None:
-        self._folder = Path(run.directory)
-        self._records = run.plan.system.records
+    def __init__(self, run: RunPlan, played: PlayedRows | None) -> None:
+        self._folder, self._plan, self._played = Path(run.directory), run.plan, played
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="sync")
         self._last: Future[None] | None = None
         self._due = 0.0
@@ -259,21 +274,23 @@ class Syncing:
             self._last = None
         if self._last is None and (now := time.monotonic()) >= self._due:
             self._due = now + _EVERY_S
-            self._last = self._worker.submit(self._sync, kept)
+            self._last = self._worker.submit(self._sync, kept, self._played.points if self._played is not None else 0)
 
-    def _sync(self, kept: Sequence[Kept]) -> None:
-        _sync(self._folder, [record.file for record in self._records], kept)
-        drop_older(self._folder, self._records, kept)
+    def _sync(self, kept: Sequence[Kept], played: int) -> None:
+        _sync(self._folder, [record.file for record in self._plan.system.records], kept, played)
+        drop_older(self._folder, self._plan, kept, played)
 
 
-def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept]) -> None:
+def _sync(folder: Path, results: Sequence[str], kept: Sequence[Kept], played: int) -> None:
     journals = {path.name: _give_to_disk(path) for path in _journals(folder).glob(f"*{JOURNAL}")}
     _give_to_disk(_journals(folder))
     for file, own in zip(results, kept, strict=True):
         if own.rows:
             _give_to_disk(_growing(file))
             _give_to_disk(_growing(file).parent)
-    _replace(folder / _ON_DISK, line_of(_OnDisk(tuple(kept), journals)))
+    if played:
+        _give_to_disk(folder / PLAYED_ROWS)
+    _replace(folder / _ON_DISK, line_of(_OnDisk(tuple(kept), journals, played)))
 
 
 def _give_to_disk(path: Path) -> int:

@@ -21,11 +21,14 @@ from ..errors import ConfigurationError, UnknownName
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.registry import decode_section
 from ..results.formats import goes_on
+from ..results.played_rows import PLAYED_ROWS, PlayedRows
+from ..rings.library import why_no_library
 from ..simtime import ENDLESS
 from ..system.attempt import Attempt
 from ..system.layout import row_bytes
 from ..system.placement import manual_hosts
 from ..system.plan import RECORDER, NodePlan, Plan
+from ..system.played_nodes import played_nodes
 from ..system.start_values import why_not_settable
 from ..system.states import BeginsWith
 from ..text import counted, did_you_mean, listed, meant, nearest, shown
@@ -45,6 +48,7 @@ __all__ = [
     "opening_in",
     "read_node",
     "read_run",
+    "why_no_checkpoints",
 ]
 
 MANUAL = "hand"
@@ -121,6 +125,7 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         max_restarts: how often it may be started again.
         rows: of each result file, how many rows it has from before.
         replays_to: the last point that was seen before: up to it, the run is as it was.
+        plays_to: the point of ``begins_with`` where only some nodes have states: they play their rows up to it.
         directory: the folder for what `--resume` needs, absolute; empty: there is none.
     """
 
@@ -137,18 +142,28 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_restarts: int = 0
     rows: tuple[int, ...] = ()
     replays_to: int = 0
+    plays_to: int = 0
     directory: str = ""
 
     @property
     def checkpoint_s(self) -> float | None:
-        """How often in s there is a checkpoint for a restart; None: never.
-
-        Nodes started by hand cannot get states, and a file that cannot go on has its first rows from the first point.
-        """
+        """How often in s there is a checkpoint for a restart; None: never."""
         recovery = self.loaded.config.recovery
-        is_wanted = self.directory or (recovery.mode == "restart" and self.restarts < self.max_restarts)
-        can = not manual_hosts(self.plan) and all(goes_on(own.file) for own in self.plan.system.records)
-        return recovery.checkpoint_s if is_wanted and can else None
+        is_wanted = recovery.mode == "restart" and self.restarts < self.max_restarts
+        return recovery.checkpoint_s if (is_wanted or self.directory) and not why_no_checkpoints(self.plan) else None
+
+    def played_rows(self) -> PlayedRows | None:
+        """Open the file for the rows of the nodes that may have to play them; None: none has to."""
+        plan = self.plan
+        if not plan.played or self.checkpoint_s is None:
+            return None
+        rows = {
+            item.name: (row_bytes(item.outputs), item.step_points)
+            for name in plan.played
+            for item in plan.nodes[name].instances
+            if item.outputs.columns
+        }
+        return PlayedRows(self.kept_in / PLAYED_ROWS, rows)
 
     @property
     def config_file(self) -> Path:
@@ -229,7 +244,9 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             folder = self.kept_in / JOURNALS if self.directory else self.kept_in
             box = box_of(folder, participant)
             journal = str((box if box.is_dir() else folder) / f"{box.name}{JOURNAL}")
-        return Attempt(number, most, self.replays_to, journal)
+        plays_to = self.plays_to if participant in self.plan.played else 0
+        rows = str(self.kept_in / PLAYED_ROWS) if plays_to else ""
+        return Attempt(number, most, self.replays_to, journal, plays_to, rows)
 
     @property
     def kept_in(self) -> Path:
@@ -294,6 +311,17 @@ class RunPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             text = f"the runtime folder '{folder}' cannot be used: {error.strerror}"
             raise ConfigurationError(text, hint="Set FMU_MESH_RUNTIME_DIR to another folder.") from error
         return file
+
+
+def why_no_checkpoints(plan: Plan) -> str:
+    """Why a run of this plan has no checkpoints for a restart, in words; empty: it can have them."""
+    for host in manual_hosts(plan):  # a state cannot get there
+        return f"the nodes of host '{host}' are started by hand"
+    for record in plan.system.records:
+        if not goes_on(record.file):
+            return f"the format of '{record.file}' cannot go on"
+    played, library = played_nodes(plan.system, plan.outputs), why_no_library()
+    return f"the library of C is {library}" if played.names and library is not None else played.refused
 
 
 def numbered(file: Path, resets: int) -> Path:

@@ -27,10 +27,11 @@ from msgspec.structs import replace
 from .. import __version__, files
 from ..errors import CallRefused, ConfigurationError, Finding
 from ..files import Kept
-from ..system.plan import RECORDER, make_plan
-from ..system.records import RecordPlan
+from ..results.played_rows import PLAYED_ROWS, PlayedRows, rows_to_play
+from ..system.plan import RECORDER, Plan, make_plan
+from ..system.played_nodes import stateless
 from ..system.series_files import courses_of
-from ..system.states import BeginsWith, SavedInstance, differences, saved_instances, stateless
+from ..system.states import BeginsWith, SavedInstance, differences, saved_instances
 from ..text import nearest, option_text, short_number
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
@@ -226,27 +227,30 @@ def state_bytes(
     """
     grid = run.plan.grid
     blocks = {name: (len(own), hashlib.sha256(own).digest()) for name, own in states.items()}
-    instances = saved_instances(run.plan, run.contents, others)
+    instances = {name: own for name, own in saved_instances(run.plan, run.contents, others).items() if name in states}
     own = _Head(__version__, run.mesh, point, grid.start_time, grid.step_size, instances, blocks)
     head = msgspec.msgpack.encode(own)
     start = _START.pack(_LETTERS, _VERSION, len(head), hashlib.sha256(head).digest())
     return b"".join((start, head, *states.values()))
 
 
-def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
+def keeper(run: RunPlan, played: PlayedRows | None) -> Callable[[int, bytes], None]:
     """A function that keeps the checkpoint at a point for a restart of a run; `drop_older` removes those before.
 
     With a directory it gives them to the disk, on a thread of its own; a checkpoint that comes meanwhile is left out.
-    The errors are those of `write_state`; with a directory, they are of the checkpoint before.
+    The errors are those of `write_state`; with a directory, they are of the checkpoint before. After a checkpoint,
+    nodes may have to have ``played`` their rows: if these cannot be written, that is an error, too.
     """
     folder, worker, last = run.kept_in, ThreadPoolExecutor(1, thread_name_prefix="checkpoints"), list[Future[None]]()
 
     def keep(point: int, data: bytes) -> None:
         file = folder / f"{point}{STATE}"
+        if played is not None and played.error:
+            raise ConfigurationError(played.error)
         if not run.directory:
             write_state(file, data, synced=False)
-            if not run.plan.system.records:  # nobody writes rows
-                drop_older(folder, (), ())
+            if not run.plan.system.records and played is None:  # nobody writes rows
+                drop_older(folder, run.plan, (), 0)
         elif not last or last[-1].done():
             if last:
                 last.pop().result()
@@ -255,22 +259,23 @@ def keeper(run: RunPlan) -> Callable[[int, bytes], None]:
     return keep
 
 
-def drop_older(folder: Path, records: Sequence[RecordPlan], kept: Sequence[Kept]) -> None:
+def drop_older(folder: Path, plan: Plan, kept: Sequence[Kept], played: int) -> None:
     """Remove the checkpoints before the newest one of which the files have all rows before it.
 
-    ``kept`` is what they have. How far they are behind the steps is up to the disk, so there may be any number of newer
-    checkpoints that cannot be used yet.
+    ``kept`` is what they have, and the ``played`` points are those of which rows can be played. How far files are
+    behind the steps is up to the disk, so there may be any number of newer checkpoints that cannot be used yet.
     """
     states = iter(_newest_first(folder))
     for file in states:
-        if _has_rows(_point_of(file), records, [own.rows for own in kept]):
+        if _has_rows(_point_of(file), plan, [own.rows for own in kept], played):
             break
     for file in states:
         file.unlink(missing_ok=True)
 
 
-def _has_rows(point: int, records: Sequence[RecordPlan], rows: Sequence[int]) -> bool:
-    return all(there >= own.rows_before(point) for there, own in zip(rows, records, strict=True))
+def _has_rows(point: int, plan: Plan, rows: Sequence[int], played: int) -> bool:
+    records = zip(rows, plan.system.records, strict=True)
+    return all(there >= own.rows_before(point) for there, own in records) and (not plan.played or 0 < point <= played)
 
 
 def _newest_first(folder: Path) -> list[Path]:
@@ -281,18 +286,22 @@ def _newest_first(folder: Path) -> list[Path]:
 def again_from_checkpoint(run: RunPlan, folder: Path, rows: Sequence[int]) -> RunPlan:
     """A run that starts again, from its newest checkpoint of which all files have the ``rows`` before it.
 
-    Without one, it begins where it began.
+    Without one, it begins where it began. Where instances have no state, it does that, too, and others play their rows.
     """
-    system = run.plan.system
+    system, played = run.plan.system, rows_to_play(folder / PLAYED_ROWS)
     for file in _newest_first(folder):
         with suppress(ConfigurationError):  # its writer was killed
             state = StateFile.read(file)
             point = state.head.point
-            if _has_rows(point, system.records, rows):
-                grid = replace(run.plan.grid, first_point=point)
-                nodes = {name: replace(node, grid=grid) for name, node in run.plan.nodes.items()}
-                plan = replace(run.plan, system=replace(system, grid=grid), nodes=nodes)
-                return replace(run, plan=plan, begins_with=BeginsWith(dict(state.states)))
+            if not _has_rows(point, run.plan, rows, played):
+                continue
+            if run.plan.played:
+                seen = max(run.replays_to, point)
+                return replace(run, begins_with=BeginsWith(dict(state.states)), plays_to=point, replays_to=seen)
+            grid = replace(run.plan.grid, first_point=point)
+            nodes = {name: replace(node, grid=grid) for name, node in run.plan.nodes.items()}
+            plan = replace(run.plan, system=replace(system, grid=grid), nodes=nodes)
+            return replace(run, plan=plan, begins_with=BeginsWith(dict(state.states)))
     return run
 
 

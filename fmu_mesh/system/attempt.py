@@ -16,12 +16,16 @@ class Attempt(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         replays_to: the last point that was seen in those before, or of the run that is resumed; up to it, the run is
             as it was.
         journal: the file with what this process was given from outside; empty: there is none.
+        plays_to: the point up to which it plays its rows, and at which it loads its states; 0: it plays none.
+        rows: the file with these rows.
     """
 
     number: int = 1
     most: int = 1
     replays_to: int = 0
     journal: str = ""
+    plays_to: int = 0
+    rows: str = ""
 
     @property
     def may_be_followed(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import msgspec
 
@@ -36,11 +36,15 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def links_of(
-    system: ResolvedSystem, reads: Iterable[tuple[str, str, str]], initialization: InitializationPlan
+    system: ResolvedSystem,
+    reads: Iterable[tuple[str, str, str]],
+    initialization: InitializationPlan,
+    kept: Mapping[str, Iterable[str]],
 ) -> tuple[Link, ...]:
     """One link per instance and other node that needs its outputs: to the recorder last, then the initial ones.
 
-    Steps need what ``reads`` has: source instance, column, target instance.
+    Steps need what ``reads`` has: source instance, column, target instance. The recorder also needs the columns of
+    instances that are ``kept``, to play their rows.
     """
     node_of = {name: own.node for name, own in system.instances.items()}
     needed: dict[tuple[str, str], set[str]] = {}
@@ -49,6 +53,9 @@ def links_of(
             needed.setdefault((source, node_of[target]), set()).add(system.base_of(source, column))
     for name, variable in system.recorded:
         needed.setdefault((name, RECORDER), set()).add(system.base_of(name, variable))
+    for name, columns in kept.items():
+        if own := {*columns}:
+            needed.setdefault((name, RECORDER), set()).update(own)
     links = []
     ends = sorted(needed, key=lambda end: (end[0], end[1] == RECORDER, end[1]))
     initial = _needed_initially(system, initialization, needed)

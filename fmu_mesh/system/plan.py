@@ -34,6 +34,7 @@ from .linear_inputs import LinearInput
 from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .node_links import Link, links_of
+from .played_nodes import keeps_states, played_nodes
 from .records import RecordPlan, union_of
 from .schedule import Schedule, row_of
 from .start_values import why_not_settable
@@ -127,6 +128,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
         records: the result files, if it is the recorder; ``secured``: whether those who set values have names.
         process: what its process may take; ``host``: the host that it runs on; None: that of `launch`.
+        saves: whether the states of its instances belong to a checkpoint for a restart.
     """
 
     mesh: str
@@ -155,6 +157,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     secured: bool = False
     process: ProcessConfig = ProcessConfig()
     host: str | None = None
+    saves: bool = True
 
     def instance(self, name: str) -> InstancePlan:
         """The plan of one of its instances."""
@@ -196,6 +199,7 @@ class Plan(msgspec.Struct, frozen=True):
         closing: the connections that have a delay of 1 because they close a cycle.
         consistent: the formula of each output that is made consistent, by instance and name of the output or element.
         nodes: by node name, with the recorder if there is one.
+        played: the nodes whose rows are kept for a restart, because others have no state.
     """
 
     system: ResolvedSystem
@@ -208,6 +212,7 @@ class Plan(msgspec.Struct, frozen=True):
     window: int
     digest: str
     nodes: dict[str, NodePlan]
+    played: tuple[str, ...] = ()
 
     @property
     def grid(self) -> TimeGrid:
@@ -219,6 +224,11 @@ class Plan(msgspec.Struct, frozen=True):
         """The hosts that nodes run on, besides the one of `launch`, by name."""
         named = {node.host for node in self.nodes.values()}
         return {name: host for name, host in self.system.config.deploy.hosts.items() if name in named}
+
+    @property
+    def outputs(self) -> dict[str, Layout]:
+        """The columns of the rows of each instance."""
+        return {item.name: item.outputs for node in self.nodes.values() for item in node.instances}
 
     def node_of(self, instance: str) -> str:
         """The name of the node of an instance."""
@@ -251,10 +261,10 @@ def make_plan(
     reads = reads_of(connections, consistent)
     outputs = system.output_layouts(read[:2] for read in reads)
     window = window_of(system.config.simulation.window if window is None else window, outputs.values())
-    plan = Plan(
-        system, connections, order, cycles, closing, consistent, initialization, window=window, digest="", nodes={}
-    )
-    nodes = _nodes(plan, outputs, links_of(system, reads, initialization))
+    played = played_nodes(system, outputs).names if keeps_states(system.config.recovery) else ()
+    plan = Plan(system, connections, order, cycles, closing, consistent, initialization, window, "", {}, played)
+    kept = {name: own.names for name, own in outputs.items() if system.instances[name].node in played}
+    nodes = _nodes(plan, outputs, links_of(system, reads, initialization, kept))
     digest = _digest(system, nodes, contents)
     return replace(plan, digest=digest, nodes={name: replace(node, digest=digest) for name, node in nodes.items()})
 
@@ -288,7 +298,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> 
     system, config = plan.system, plan.system.config
     recorded = {link.source for link in links if link.target_node == RECORDER}
     windows = dict.fromkeys((instance.node for instance in system.instances.values()), plan.window)
-    if system.records:
+    if recorded:
         windows[RECORDER] = recorder_window(plan.window, [row_bytes(outputs[name]) for name in recorded])
     longest_step = max(instance.step_points for instance in system.instances.values())
     rings = {}
@@ -336,6 +346,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> 
             secured=config.security is not None,
             process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
             host=config.deploy.known(config.instances[members[0]].host) if members else None,
+            saves=not plan.played or node in plan.played,
         )
     return nodes
 

@@ -1,4 +1,4 @@
-"""States of a system that outlive its process: which instances have one, and what must agree where one is restored.
+"""States of a system that outlive its process: what must agree where one is restored, and with which a run begins.
 
 Owns no file and no state; those are `fmu_mesh.run.state_file` and the instances.
 """
@@ -12,14 +12,13 @@ from types import MappingProxyType
 import msgspec
 
 from ..config.instance_sections import placed
-from ..text import counted, listed, shown
+from ..text import counted, shown
 from ..variables.value_conversion import to_plain
 from ..variables.value_types import PlainValue
 from .plan import Plan
 from .start_values import why_not_settable
-from .system import ResolvedSystem
 
-__all__ = ["BeginsWith", "SavedInstance", "differences", "saved_instances", "stateless"]
+__all__ = ["BeginsWith", "SavedInstance", "differences", "saved_instances"]
 
 _DIGITS = 16
 _OF_MODEL = ("kind", "model", "variables", "options")
@@ -58,23 +57,6 @@ class BeginsWith(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             {name: values for name, values in self.set_again.items() if name in known},
             self.anew,
         )
-
-
-def stateless(system: ResolvedSystem, *, keys: bool = True) -> dict[str, str]:
-    """The instances whose state cannot outlive their process, and why, as the end of a sentence.
-
-    With ``keys``, inputs get the values of their Zenoh keys, as in processes.
-    """
-    found = {}
-    for name, own in system.instances.items():
-        why = system.config.instances[name].stateless(own.description)
-        if why is None and keys and own.keys_in:
-            why = (
-                f"keys of Zenoh give values to {listed([key.variable for key in own.keys_in])}, and these have no past"
-            )
-        if why is not None:
-            found[name] = why
-    return found
 
 
 def saved_instances(

@@ -210,7 +210,7 @@ def test_after_most_restarts_the_run_ends_and_keeps_its_rows(place: Place) -> No
 
 
 def test_a_component_that_reads_the_clock_is_named(place: Place) -> None:
-    config = written(place, "clock")
+    config = written(place, "clock", recovery={"mode": "restart", "checkpoint_s": None})
     launched = place.start("launch", config, "--no-progress")
 
     killed(launched, result := config.with_suffix(".csv"), "gain", 500)
