@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config.call_options import option_fields
-from ..run.options import SimulateOptions
+from ..run.options import ConvergenceOptions, SimulateOptions
 from ..sweeps.sweep_options import SweepOptions
 from .arguments import (
     ACCESS,
@@ -25,7 +25,7 @@ from .arguments import (
     switch,
     whole,
 )
-from .run_options import CONFIGURED, PLACED, add_options, options
+from .run_options import CONFIG, CONFIGURED, PLACED, add_options, options
 
 __all__ = ["HERE", "PARSERS", "SIMULATION"]
 
@@ -230,6 +230,20 @@ PARSERS: Parsers = {
             options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
         ),
         options("state", "keys_from", "allow_code"),
+        *_OUTPUT,
+        json_switch("print what came out as one JSON object, and nothing else on standard output"),
+    ),
+    "convergence": (
+        *CONFIG,
+        options("halvings", of=ConvergenceOptions),
+        argument("--output", "FILE.csv", "write the table into this file", type=Path),
+        argument("--plot", "FILE.png", "draw errors over the step size and the wall-clock time", type=Path),
+        group("how it runs", options("workers", "folder", "resume", "force", of=ConvergenceOptions)),
+        group(
+            "instead of what CONFIG says, for all runs",
+            options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
+        ),
+        options("allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
     ),
