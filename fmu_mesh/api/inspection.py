@@ -265,7 +265,7 @@ def _other_kind(inspection: Inspection) -> str:
     if len(inspection.description.kinds) < 2:
         return ""
     section = msgspec.convert({KIND: _FMU, _FMU: inspection.file}, KINDS.section(_FMU))
-    return f"co-simulation; it {section.other_kind(inspection.description)}"
+    return f"co-simulation: it {section.other_kind(inspection.description)}"
 
 
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}

@@ -97,9 +97,6 @@ class ConvergenceOptions(VariantOptions, frozen=True, kw_only=True):
         super().__post_init__()
         if self.halvings > _MOST_HALVINGS:
             raise CallRefused(f"`halvings={self.halvings}`: expected a whole number from 1 to {_MOST_HALVINGS}")
-        if self.keys_from is not None:
-            hint = "Its values belong to points, which other step sizes move."
-            raise CallRefused("`keys_from` for runs with other step sizes", hint=hint)
 
 
 class OpenOptions(VariantOptions, frozen=True):

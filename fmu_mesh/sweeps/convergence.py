@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..api.mesh_builder import Mesh
 from ..api.result import recorded_variables
 from ..config.call_options import checked
-from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, MeshLost
+from ..errors import CallRefused, ConfigurationError, FmuError, FmuMeshError, Interrupted, MeshLost
 from ..files import write_whole
 from ..pictures.convergence_drawing import convergence_figure
 from ..pictures.tables import html_table, table
@@ -92,7 +92,7 @@ class Convergence(msgspec.Struct, frozen=True):
         >>> import fmu_mesh
         >>> found = fmu_mesh.load("configs/cycle2.yaml").convergence(stop_time=1.0)
         >>> found.step_sizes, found.steps, found.points
-        ((0.01, 0.005, 0.0025), (200, 400, 800), 101)
+        ((0.001, 0.0005, 0.00025), (2000, 4000, 8000), 1001)
 
     Attributes:
         step_sizes: that of each run in s, the largest first; ``steps``: the steps of all its instances together.
@@ -170,6 +170,10 @@ class Convergence(msgspec.Struct, frozen=True):
 @contextmanager
 def converging(mesh: Mesh, options: ConvergenceOptions) -> Iterator[tuple[Sweep, Callable[[], Convergence]]]:
     """Start the runs, which end with the block, and what says at their end what was found; see `Mesh.convergence`."""
+    if options.keys_from is not None:
+        raise CallRefused(
+            "`keys_from` for runs with other step sizes", hint="Its values belong to points: leave it out."
+        )
     given = options.given()
     plan = mesh.plan(
         **{name: given[name] for name in VariantOptions.__struct_fields__ if name in given}, record="memory"

@@ -262,7 +262,6 @@ SPELLS_FLAGS = {
     "run/options.py": "it says how the command line spells them",
     "hosts/processes.py": "commands that an engine runs",
     "hosts/slurm.py": "options of sbatch",
-    "sweeps/sweep_options.py": "as `run/options.py`",
     "sweeps/slurm_array.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
     "__main__.py": "it reads the command line",
