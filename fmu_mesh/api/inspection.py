@@ -229,6 +229,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     if indicators := description.event_indicators:
         states.append(counted(indicators, "event indicator"))
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    other = msgspec.convert({KIND: _FMU, _FMU: inspection.file}, KINDS.section(_FMU)).other_kind(description)
     platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
@@ -237,7 +238,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("Model", description.model_name),
         ("Description", description.description or ""),
         ("Kind", _kind(description)),
-        ("Used as", _other_kind(inspection)),
+        ("Used as", f"co-simulation: it {other}" if other is not None else ""),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
@@ -258,14 +259,6 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
 def _kind(description: ModelDescription) -> str:
     kinds = " or ".join(_KIND_WORDS[kind] for kind in description.kinds)
     return f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")
-
-
-def _other_kind(inspection: Inspection) -> str:
-    """What is used of an FMU that has both kinds; empty for all others."""
-    if len(inspection.description.kinds) < 2:
-        return ""
-    section = msgspec.convert({KIND: _FMU, _FMU: inspection.file}, KINDS.section(_FMU))
-    return f"co-simulation: it {section.other_kind(inspection.description)}"
 
 
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}

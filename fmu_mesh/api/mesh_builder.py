@@ -618,19 +618,12 @@ class Mesh:
     def convergence(self, options: ConvergenceOptions) -> Convergence:
         """Run the mesh with smaller and smaller steps, and estimate its error by the differences (docs/convergence.md).
 
-        Example:
-            >>> mesh = fmu_mesh.load("configs/cycle2.yaml")
-            >>> found = mesh.convergence(stop_time=1.0)
-            >>> [(own.name, round(own.order, 1)) for own in found.variables]
-            [('position.y', 1.0), ('velocity.y', 1.0)]
-
         Args:
             options: see `ConvergenceOptions`.
 
         Raises:
-            CallRefused: an option is wrong; or the program has no `if __name__ == "__main__":`, as for `sweep`.
-            ConfigurationError: the mesh is wrong, has no stop time, or cannot have smaller steps.
-            FmuMeshError: a run has failed; names its step size.
+            CallRefused: an option is wrong, or the program has no `if __name__ == "__main__":`, as for `sweep`.
+            FmuMeshError: the mesh is wrong, or cannot have smaller steps; or a run has failed: names its step size.
         """
         from .. import Convergence  # noqa: PLC0415  its runs are a sweep, which is a user of this module
 

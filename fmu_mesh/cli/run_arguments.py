@@ -57,6 +57,10 @@ def _add_target(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("-o", "--to", metavar="FILE", help=text, type=Path, dest="target")
 
 
+_FOR_ALL_RUNS = group(
+    "instead of what CONFIG says, for all runs",
+    options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
+)
 _SLURM_OPTION = argument(
     "--slurm-option",
     "OPTION",
@@ -225,10 +229,7 @@ PARSERS: Parsers = {
             _SLURM_OPTION,
             switch("--no-wait", text="submit only; the same command follows it later"),
         ),
-        group(
-            "instead of what CONFIG says, for all runs",
-            options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
-        ),
+        _FOR_ALL_RUNS,
         options("state", "keys_from", "allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
@@ -239,10 +240,7 @@ PARSERS: Parsers = {
         argument("--output", "FILE.csv", "write the table into this file", type=Path),
         argument("--plot", "FILE.png", "draw errors over the step size and the wall-clock time", type=Path),
         group("how it runs", options("workers", "folder", "resume", "force", of=ConvergenceOptions)),
-        group(
-            "instead of what CONFIG says, for all runs",
-            options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
-        ),
+        _FOR_ALL_RUNS,
         options("allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),

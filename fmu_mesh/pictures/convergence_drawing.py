@@ -27,24 +27,19 @@ def convergence_figure(
 
     A curve has one value for each run, the coarsest first; or one fewer: then it has differences between two runs,
     which are dotted.
-
-    Example:
-        >>> figure = convergence_figure("m", [0.2, 0.1, 0.05], [10, 20, 40], {"a.y": [4.0, 2.0, 1.0]})
-        >>> [axes.get_xlabel() for axes in figure.axes]
-        ['step size in s', 'steps of all instances']
     """
     figure = empty_figure()
     figure.set_size_inches(*_INCHES)
     names = {f"{name} (difference)" if len(own) < len(steps) else name: own for name, own in curves.items()}
-    drawn = {name: [one if 0.0 < one < np.inf else np.nan for one in own] for name, own in names.items()}
-    above = 2.0 * np.nanmax([own[0] for own in drawn.values()]) if drawn else np.nan
+    above = 2.0 * max((one for own in curves.values() for one in own), default=0.5)
     with silently():
         panels = figure.subplots(1, 2, sharey=True)
         for axes, places, side in ((panels[0], step_sizes, "left"), (panels[1], steps, "right")):
             axes.set(xscale="log", yscale="log")
             axes.set_xlabel("step size in s" if side == "left" else "steps of all instances")
             lines: list[Any] = []
-            for number, values in enumerate(drawn.values()):
+            for number, errors in enumerate(curves.values()):
+                values = [one or np.nan for one in errors]  # no difference has no place on the axis
                 dashes = DASHES[number // COLOURS % len(DASHES)] if len(values) == len(places) else "dotted"
                 style = {"color": PALETTE[number % COLOURS], "linestyle": dashes, "marker": "o", "markersize": 4}
                 lines += axes.plot(places[: len(values)], values, **style)
@@ -55,7 +50,7 @@ def convergence_figure(
             axes.set_xticks(places, [f"{place:.4g}" for place in places])
             axes.set_xticks([], minor=True)
             style_axes(axes, "error / largest value" if side == "left" else "", is_empty=False)
-            if side == "right" and drawn:
-                add_legend(axes, lines, [short(name) for name in drawn])
+            if side == "right" and curves:
+                add_legend(axes, lines, [short(name) for name in names])
         figure.suptitle(short(title), fontweight="bold", fontsize=12, parse_math=False)
     return figure

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
@@ -27,6 +27,7 @@ from ..files import write_whole
 from ..pictures.convergence_drawing import convergence_figure
 from ..pictures.tables import html_table, table
 from ..printing import page
+from ..results.recording import Columns
 from ..run.options import ConvergenceOptions, VariantOptions
 from ..run.run_plan import RunPlan
 from ..text import counted, listed, short_number
@@ -39,20 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Convergence", "converging"]
 
-_ORDERS: Final = (0.8, 4.5)
-"""The least and the largest order that is plausible."""
-_APART: Final = 0.5
-"""How far orders may be apart that are one order."""
+_LEAST, _LARGEST, _APART = 0.8, 4.5, 0.5
+"""Between which ends an order is plausible, and how far orders may be apart that are one order."""
+_SAME: Final = "no difference beyond rounding between the two finest runs"
 _STEP: Final = "simulation.step_size"
 _HEADING: Final = ("variable", "order", "order (RMS)", "estimated error", "relative", "")
-
-Verdict = Literal[
-    "converges",
-    "not in the range where it converges",
-    "not in the range where it converges: NaN or infinite",
-    "no difference beyond rounding between the two finest runs",
-    "one more halving is needed to know",
-]
 
 
 class VariableConvergence(msgspec.Struct, frozen=True):
@@ -60,7 +52,7 @@ class VariableConvergence(msgspec.Struct, frozen=True):
 
     Attributes:
         name: `instance.variable`; ``unit``: its unit, None without one.
-        verdict: `converges`, or why there is no order and no error.
+        verdict: `converges`, or in words why there is no order and no error.
         order: by the largest difference at the common points; ``rms_order``: by the root mean square.
         error: the largest error of the finest run at these points, estimated by Richardson, in the unit.
         largest: the largest absolute value of the finest run.
@@ -69,20 +61,12 @@ class VariableConvergence(msgspec.Struct, frozen=True):
 
     name: str
     unit: str | None
-    verdict: Verdict
+    verdict: str
     order: float | None
     rms_order: float | None
     error: float | None
     largest: float
     differences: tuple[float, ...]
-
-    @property
-    def cells(self) -> tuple[str, ...]:
-        """Its row of the table."""
-        if self.error is None:
-            return self.name, "", "", "", "", self.verdict
-        error, relative = f"{self.error:.2g} {self.unit or ''}".rstrip(), f"{self.error / self.largest:.1g}"
-        return self.name, f"{self.order:.2f}", f"{self.rms_order:.2f}", error, relative, ""
 
 
 class Convergence(msgspec.Struct, frozen=True):
@@ -118,7 +102,7 @@ class Convergence(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         lines = [f"{self._head}, compared at {counted(self.points, 'common point')}", ""]
-        lines += table([own.cells for own in self.variables], heading=_HEADING) or ["no continuous variable"]
+        lines += table(self._cells(), heading=_HEADING) or ["no continuous variable"]
         if others := [f"{name} ({why})" for name, why in self.not_compared.items()]:
             lines += ["", f"not compared: {listed(others)}"]
         if any(own.error is not None for own in self.variables):
@@ -130,7 +114,15 @@ class Convergence(msgspec.Struct, frozen=True):
         return f"<Convergence of {self._head}>"
 
     def _repr_html_(self) -> str:
-        return html_table(self._head, _HEADING, (own.cells for own in self.variables), len(self.variables))
+        return html_table(self._head, _HEADING, self._cells(), len(self.variables))
+
+    def _cells(self) -> Iterator[tuple[str, ...]]:
+        for own in self.variables:
+            if own.error is None:
+                yield own.name, "", "", "", "", own.verdict
+            else:
+                error, relative = f"{own.error:.2g} {own.unit or ''}".rstrip(), f"{own.error / own.largest:.1g}"
+                yield own.name, f"{own.order:.2f}", f"{own.rms_order:.2f}", error, relative, ""
 
     @property
     def _head(self) -> str:
@@ -159,11 +151,11 @@ class Convergence(msgspec.Struct, frozen=True):
         """
         curves = {}
         for own in self.variables:
-            if own.order is not None and own.error is not None:
-                scale = own.error * 2.0**own.order / own.differences[-1]
-                curves[own.name] = [*(scale * one / own.largest for one in own.differences), own.error / own.largest]
-            elif own.verdict in ("not in the range where it converges", "one more halving is needed to know"):
-                curves[own.name] = [one / own.largest for one in own.differences]
+            errors = np.array(own.differences)
+            if own.order is not None and own.error is not None:  # that of a run is in proportion to its difference
+                errors = own.error * np.append(2.0**own.order * errors / errors[-1], 1.0)
+            if own.verdict != _SAME and np.isfinite([*errors, own.largest]).all():
+                curves[own.name] = (errors / (own.largest or 1.0)).tolist()
         return convergence_figure(title or self.mesh, self.step_sizes, self.steps, curves)
 
 
@@ -212,36 +204,37 @@ def _found(runs: Sweep, plan: RunPlan) -> Convergence:
     Raises:
         FmuMeshError: one has failed; of the class that its exit code says.
     """
-    rows, result, last = {}, runs.result, plan.plan.grid.last_point
     variables = {name: own for name, (_, own) in recorded_variables(plan.plan.system).items()}
-    why = {name: "discrete" if is_float(own.type) else own.type for name, own in variables.items()}
     names = [name for name, own in variables.items() if is_float(own.type) and own.variability != "discrete"]
-    curves: list[tuple[NDArray[np.float64], dict[str, NDArray[Any]]]] = []
-    for place, row in reversed([*enumerate(result)]):  # the finest began first
-        size = float(str(row.parameters[_STEP]))
+    others = {name: "discrete" if is_float(own.type) else own.type for name, own in variables.items()}
+    sizes, warnings, curves = list[float](), list[str](), list[Columns]()
+    for place, row in reversed([*enumerate(runs.result)]):  # the finest began first
+        sizes.append(float(str(row.parameters[_STEP])))
+        what = f"the run with steps of {short_number(sizes[-1])} s"
         if row.exit_code:
             kinds = {one.exit_code: one for one in (ConfigurationError, FmuError, MeshLost)}
-            text = f"the run with steps of {short_number(size)} s failed: {row.message}"
-            raise kinds.get(row.exit_code, FmuMeshError)(text, hint="Choose another `step_size`, or fewer `halvings`.")
-        rows[size], own = row, result.curves(place)
+            hint = "Choose another `step_size`, or fewer `halvings`."
+            raise kinds.get(row.exit_code, FmuMeshError)(f"{what} failed: {row.message}", hint=hint)
+        warnings += [f"{what}: {row.message}"] if row.message else []
+        own = runs.result.curves(place)
         # A step is halved exactly, so times of common points are the same floats.
-        kept = np.isin(own.times, curves[-1][0]) if curves else np.ones(len(own.times), bool)
-        curves.append((own.times[kept], {name: own[name][kept] for name in names}))
-    common = curves[-1][0]
-    if not len(common):
+        curves.append(_at(curves[-1].times if curves else own.times, own.times, {name: own[name] for name in names}))
+    curves = [_at(curves[-1].times, *own[:2]) for own in curves]
+    if not (points := len(curves[0].times)):
         raise ConfigurationError("the runs have recorded no common point", hint="Record every point.")
-    of_all = [{name: values[np.isin(times, common)] for name, values in own.items()} for times, own in curves]
-    steps = sum(last // own.step_points for own in plan.plan.system.instances.values())
-    finest = last << len(rows) - 1
-    return Convergence(
-        plan.mesh,
-        tuple(rows),
-        tuple(steps << number for number in range(len(rows))),
-        len(common),
-        tuple(_judged(name, variables[name].unit, [own[name] for own in of_all], finest) for name in names),
-        {name: why[name] for name in variables if name not in names},
-        tuple(f"steps of {short_number(size)} s: {row.message}" for size, row in rows.items() if row.message),
+    last, instances = plan.plan.grid.last_point, plan.plan.system.instances.values()
+    steps = tuple(sum(last // own.step_points for own in instances) << number for number in range(len(sizes)))
+    judged = (
+        _judged(name, variables[name].unit, [own.values[name] for own in curves], last << len(sizes) - 1)
+        for name in names
     )
+    others = {name: why for name, why in others.items() if name not in names}
+    return Convergence(plan.mesh, tuple(sizes), steps, points, tuple(judged), others, tuple(warnings))
+
+
+def _at(common: NDArray[np.float64], times: NDArray[np.float64], values: Mapping[str, NDArray[Any]]) -> Columns:
+    kept = np.isin(times, common)
+    return Columns(times[kept], {name: own[kept] for name, own in values.items()})
 
 
 def _judged(name: str, unit: str | None, runs: Sequence[NDArray[Any]], steps: int) -> VariableConvergence:
@@ -257,14 +250,14 @@ def _judged(name: str, unit: str | None, runs: Sequence[NDArray[Any]], steps: in
     # Where the range has not begun, one order may be plausible by chance: the last two of both norms have to agree.
     orders = [*by_most[-2:], *by_rms[-2:]]
     found: tuple[float | None, float | None, float | None] = None, None, None
-    verdict: Verdict = "not in the range where it converges"
+    verdict = "not in the range where it converges"
     if not np.isfinite([*most, largest]).all():
-        verdict = "not in the range where it converges: NaN or infinite"
+        verdict += ": NaN or infinite"
     elif most[-1] <= rounding:
-        verdict = "no difference beyond rounding between the two finest runs"
+        verdict = _SAME
     elif not orders:
         verdict = "one more halving is needed to know"
-    elif min(orders) >= _ORDERS[0] and max(orders) <= _ORDERS[1] and max(orders) - min(orders) <= _APART:
+    elif min(orders) >= _LEAST and max(orders) <= min(_LARGEST, min(orders) + _APART):
         error = float(most[-1] / (2.0 ** by_most[-1] - 1.0))
         if error < largest:  # otherwise no digit is right
             verdict, found = "converges", (float(by_most[-1]), float(by_rms[-1]), error)

@@ -39,7 +39,7 @@ def transition(a: Matrix, b: Matrix, step_size: float) -> tuple[NDArray[np.float
 def moved(a: Matrix, b: Matrix, x: list[float], u: list[float], step_size: float) -> list[float]:
     """The states after a step in which the inputs hold."""
     of_states, of_inputs = transition(a, b, step_size)
-    return (of_states @ np.array(x) + of_inputs @ np.array(u)).tolist()
+    return [float(one) for one in of_states @ np.array(x) + of_inputs @ np.array(u)]
 
 
 def exact(a: NDArray[np.float64], x: list[float], step_size: float, points: int) -> NDArray[np.float64]:

@@ -162,6 +162,7 @@ def test_a_run_that_explodes_is_an_answer(tmp_path: Path) -> None:
     convergence = mesh_of(tmp_path, Growing={}).convergence(workers=1, stop_time=1.0)
 
     assert [own.verdict for own in convergence.variables] == [f"{OUTSIDE}: NaN or infinite"]
+    assert len(convergence.plot().axes[0].lines) == 2  # the slopes
 
 
 def test_an_instance_that_refuses_smaller_steps_is_named(tmp_path: Path) -> None:
@@ -248,7 +249,7 @@ def test_ctrl_c_ends_a_study_and_says_what_is_kept(place: Place) -> None:
 
 
 def test_a_picture_has_both_slopes_and_leaves_out_what_has_no_place() -> None:
-    figure = convergence_figure("m", [0.2, 0.1, 0.05], [5, 10, 20], {"a.y": [4.0, 2.0, 1.0], "b.y": [0.0, np.inf]})
+    figure = convergence_figure("m", [0.2, 0.1, 0.05], [5, 10, 20], {"a.y": [4.0, 2.0, 1.0], "b.y": [0.0, 1.0]})
 
     for axes in figure.axes:
         assert [text.get_text() for text in axes.texts] == ["order 1", "order 2"]
