@@ -238,7 +238,7 @@ PARSERS: Parsers = {
         *CONFIG,
         options("halvings", of=ConvergenceOptions),
         argument("--output", "FILE.csv", "write the table into this file", type=Path),
-        argument("--plot", "FILE.png", "draw errors over the step size and the wall-clock time", type=Path),
+        argument("--plot", "FILE.png", "draw errors over the step size and over the number of steps", type=Path),
         group("how it runs", options("workers", "folder", "resume", "force", of=ConvergenceOptions)),
         _FOR_ALL_RUNS,
         options("allow_code"),

@@ -162,27 +162,27 @@ class Convergence(msgspec.Struct, frozen=True):
 @contextmanager
 def converging(mesh: Mesh, options: ConvergenceOptions) -> Iterator[tuple[Sweep, Callable[[], Convergence]]]:
     """Start the runs, which end with the block, and what says at their end what was found; see `Mesh.convergence`."""
-    if options.keys_from is not None:
-        raise CallRefused(
-            "`keys_from` for runs with other step sizes", hint="Its values belong to points: leave it out."
-        )
     given = options.given()
-    plan = mesh.plan(
-        **{name: given[name] for name in VariantOptions.__struct_fields__ if name in given}, record="memory"
-    )
+    of_run = {name: given.pop(name) for name in VariantOptions.__struct_fields__ if name in given}
+    if "keys_from" in of_run:
+        hint = "Its values belong to points: leave it out."
+        raise CallRefused("`keys_from` for runs with other step sizes", hint=hint)
+    plan = mesh.plan(**of_run, record="memory")
     if plan.plan.grid.stop_time is None:
         raise ConfigurationError(f"mesh '{plan.mesh}' has no end", hint="Give it one, with `stop_time=...`.")
+    if not recorded_variables(plan.plan.system):
+        raise ConfigurationError(f"mesh '{plan.mesh}' records nothing to compare", hint="Name `record.variables`.")
     instances = plan.plan.system.config.instances.items()
     sizes = {f"instances.{name}.step_size": own.step_size for name, own in instances if own.step_size is not None}
     sizes[_STEP] = plan.plan.grid.step_size
     # The finest begins first: it takes as long as all others together.
     variants = [{name: size / 2**n for name, size in sizes.items()} for n in reversed(range(options.halvings + 1))]
     # A run that explodes is an answer, too.
-    given["config_values"] = {"simulation.not_finite": "record", **given.get("config_values", {})}
-    given = {name: value for name, value in given.items() if name not in ("halvings", "step_size")}
-    base = {name: given[name] for name in VariantOptions.__struct_fields__ if name in given}
+    of_run["config_values"] = {"simulation.not_finite": "record", **of_run.get("config_values", {})}
+    of_run.pop("step_size", None)
+    given.pop("halvings", None)
     try:  # before the others begin: an instance may have a fixed step of its own
-        mesh.plan(**options_of_variant(base, mesh.instances, variants[0]), record="memory")
+        mesh.plan(**options_of_variant(of_run, mesh.instances, variants[0]), record="memory")
     except ConfigurationError as error:
         text = f"The finest run has steps of {short_number(variants[0][_STEP])} s"
         raise error.with_hint(f"{text}: choose fewer `halvings`, or a larger `step_size`.") from error
@@ -190,12 +190,12 @@ def converging(mesh: Mesh, options: ConvergenceOptions) -> Iterator[tuple[Sweep,
         if options.folder is None:
             given["folder"] = stack.enter_context(TemporaryDirectory(prefix="fmu_mesh-", ignore_cleanup_errors=True))
         try:
-            runs = stack.enter_context(sweep(mesh, variants, **given))
+            runs = stack.enter_context(sweep(mesh, variants, **of_run, **given))
             yield runs, partial(_found, runs, plan)
         except Interrupted as error:
-            raise (
-                error.instead_of_hint("`folder=...` keeps its runs.") if options.folder is None else error
-            ) from error
+            if options.folder is None:
+                error.instead_of_hint("`folder=...` keeps its runs.")
+            raise
 
 
 def _found(runs: Sweep, plan: RunPlan) -> Convergence:
@@ -207,16 +207,16 @@ def _found(runs: Sweep, plan: RunPlan) -> Convergence:
     variables = {name: own for name, (_, own) in recorded_variables(plan.plan.system).items()}
     names = [name for name, own in variables.items() if is_float(own.type) and own.variability != "discrete"]
     others = {name: "discrete" if is_float(own.type) else own.type for name, own in variables.items()}
-    sizes, warnings, curves = list[float](), list[str](), list[Columns]()
-    for place, row in reversed([*enumerate(runs.result)]):  # the finest began first
-        sizes.append(float(str(row.parameters[_STEP])))
-        what = f"the run with steps of {short_number(sizes[-1])} s"
+    rows, warnings, curves = runs.result, list[str](), list[Columns]()
+    sizes = tuple(plan.plan.grid.step_size / 2**number for number in range(len(rows)))
+    for size, place in zip(sizes, reversed(range(len(rows))), strict=True):  # the finest began first
+        row, what = rows[place], f"the run with steps of {short_number(size)} s"
         if row.exit_code:
             kinds = {one.exit_code: one for one in (ConfigurationError, FmuError, MeshLost)}
             hint = "Choose another `step_size`, or fewer `halvings`."
             raise kinds.get(row.exit_code, FmuMeshError)(f"{what} failed: {row.message}", hint=hint)
         warnings += [f"{what}: {row.message}"] if row.message else []
-        own = runs.result.curves(place)
+        own = rows.curves(place)
         # A step is halved exactly, so times of common points are the same floats.
         curves.append(_at(curves[-1].times if curves else own.times, own.times, {name: own[name] for name in names}))
     curves = [_at(curves[-1].times, *own[:2]) for own in curves]
@@ -229,7 +229,7 @@ def _found(runs: Sweep, plan: RunPlan) -> Convergence:
         for name in names
     )
     others = {name: why for name, why in others.items() if name not in names}
-    return Convergence(plan.mesh, tuple(sizes), steps, points, tuple(judged), others, tuple(warnings))
+    return Convergence(plan.mesh, sizes, steps, points, tuple(judged), others, tuple(warnings))
 
 
 def _at(common: NDArray[np.float64], times: NDArray[np.float64], values: Mapping[str, NDArray[Any]]) -> Columns:

@@ -185,6 +185,7 @@ def test_an_instance_that_refuses_smaller_steps_is_named(tmp_path: Path) -> None
         ({"keys_from": "run.csv"}, "`keys_from` for runs with other step sizes"),
         ({"config_values": {"simulation.stop_time": None}}, "has no end. Give it one, with `stop_time=...`."),
         ({"stop_time": 2.0**53 * 0.015, "halvings": 1}, "has steps of 0.01 s: choose fewer `halvings`, or a larger"),
+        ({"config_values": {"record.variables": []}}, "records nothing to compare. Name `record.variables`."),
         ({"config_values": {"record.from": 0.03, "record.every": 3}}, "no common point"),
     ],
 )
