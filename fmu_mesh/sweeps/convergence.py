@@ -24,7 +24,7 @@ from ..api.result import recorded_variables
 from ..config.call_options import checked
 from ..errors import CallRefused, ConfigurationError, FmuError, FmuMeshError, Interrupted, MeshLost
 from ..files import write_whole
-from ..pictures.convergence_drawing import convergence_figure
+from ..pictures.sweep_drawing import convergence_figure
 from ..pictures.tables import html_table, table
 from ..printing import page
 from ..results.recording import Columns

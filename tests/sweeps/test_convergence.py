@@ -15,7 +15,7 @@ import pytest
 from matplotlib import image
 
 import fmu_mesh
-from fmu_mesh.pictures.convergence_drawing import convergence_figure
+from fmu_mesh.pictures.sweep_drawing import convergence_figure
 from fmu_mesh.sweeps.convergence import VariableConvergence
 from tests.helpers import FMUS, Place, wait_until
 from tests.sweeps import coupled_parts
