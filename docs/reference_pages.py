@@ -27,7 +27,7 @@ from fmu_mesh.config.instance_sections import KIND, InstanceSection
 from fmu_mesh.config.mesh import TimeoutsConfig, config_type
 from fmu_mesh.config.structure import describe
 from fmu_mesh.instances.registry import KINDS
-from fmu_mesh.run.options import RunOptions, SimulateOptions
+from fmu_mesh.run.options import ConvergenceOptions, RunOptions, SimulateOptions
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 __all__ = [
@@ -90,6 +90,13 @@ _SWEEP = """\
 ## Options of a sweep
 
 `fmu_mesh.sweep` and the command take these beside those of a run that any variant has ([sweeps](../sweeps.md)).
+"""
+
+_CONVERGENCE = """\
+## Options of a convergence study
+
+`Mesh.convergence` and the command take these beside those of a run that any variant has
+([how right is a result](../convergence.md)).
 """
 
 _DEADLINES = f"""\
@@ -188,6 +195,7 @@ def options_page() -> str:
     """The page of all options: those of a run once, those of a sweep, and the others of each command."""
     shared = {option.flag for option in option_fields(RunOptions).values()} - {None}
     parts = [_OPTIONS, _calls(RunOptions), "", _SIMULATION, _calls(SimulateOptions), "", _SWEEP, _calls(SweepOptions)]
+    parts += ["", _CONVERGENCE, _calls(ConvergenceOptions)]
     for command, (_, _, about) in COMMANDS.items():
         options = command_options(command)
         own = [option for option in options if option not in shared]

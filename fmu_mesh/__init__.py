@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from .instances.python.declarations import Input, Output, Parameter
     from .pictures.system_graph import SystemGraph
     from .results.formats import recover
+    from .sweeps.convergence import Convergence
     from .sweeps.sweep_result import SweepResult
     from .sweeps.sweeping import Sweep, sweep
     from .sweeps.variants import Range
@@ -62,6 +63,7 @@ __all__ = [
     "Comparison",
     "Component",
     "ConfigurationError",
+    "Convergence",
     "DeadlineExceeded",
     "FMIAdapter",
     "Finding",
@@ -127,6 +129,7 @@ _NAMES = {
     "instances.python.component": ("Component", "component"),
     "instances.python.declarations": ("Input", "Output", "Parameter"),
     "pictures.system_graph": ("SystemGraph",),
+    "sweeps.convergence": ("Convergence",),
     "sweeps.sweep_result": ("SweepResult",),
     "sweeps.sweeping": ("Sweep", "sweep"),
     "sweeps.variants": ("Range",),

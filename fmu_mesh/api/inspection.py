@@ -229,6 +229,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
     if indicators := description.event_indicators:
         states.append(counted(indicators, "event indicator"))
     times += [f"tolerance {short_number(experiment.tolerance)}"] if experiment.tolerance is not None else []
+    other = msgspec.convert({KIND: _FMU, _FMU: inspection.file}, KINDS.section(_FMU)).other_kind(description)
     platforms = ", ".join(_PLATFORM_WORDS.get(name, name) for name in description.platforms)
     size = f" ({inspection.bytes} bytes)" if inspection.bytes is not None else " (a folder)"
     facts = [
@@ -237,6 +238,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("Model", description.model_name),
         ("Description", description.description or ""),
         ("Kind", _kind(description)),
+        ("Used as", f"co-simulation: it {other}" if other is not None else ""),
         ("Identifier", description.model_identifier),
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),

@@ -25,7 +25,7 @@ from ..files import write_whole
 from ..instances.python.python_section import importing
 from ..instances.registry import KINDS
 from ..pictures.tables import html_table, shortened
-from ..run.options import BatchOptions, OpenOptions, PlanOptions, RunOptions, StartOptions
+from ..run.options import BatchOptions, ConvergenceOptions, OpenOptions, PlanOptions, RunOptions, StartOptions
 from ..run.overriding import memory_file, memory_of
 from ..run.preparing import KnownModels, planned, without_keys
 from ..run.run_plan import RunPlan
@@ -48,6 +48,7 @@ from .mesh_editing import (
 )
 
 if TYPE_CHECKING:
+    from .. import Convergence
     from ..errors import Finding
     from ..pictures.system_graph import SystemGraph
     from .batch import Batch
@@ -612,6 +613,21 @@ class Mesh:
         if to_its_end and memory_of(plan) is not None and "memory_limit" not in how:  # a chosen limit is an end
             check_memory(plan, options.memory_limit, to_its_end=True)
         return Run.start(plan, **how)
+
+    @takes(ConvergenceOptions)
+    def convergence(self, options: ConvergenceOptions) -> Convergence:
+        """Run the mesh with smaller and smaller steps, and estimate its error by the differences (docs/convergence.md).
+
+        Args:
+            options: see `ConvergenceOptions`.
+
+        Raises:
+            CallRefused: an option is wrong, or the program has no `if __name__ == "__main__":`, as for `sweep`.
+            FmuMeshError: the mesh is wrong, or cannot have smaller steps; or a run has failed: names its step size.
+        """
+        from .. import Convergence  # noqa: PLC0415  its runs are a sweep, which is a user of this module
+
+        return Convergence.of(self, options)
 
     @takes(OpenOptions)
     def open(self, options: OpenOptions) -> System:

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-__all__ = ["Result", "imported_pandas", "result_of", "summary_of", "types_of"]
+__all__ = ["Result", "imported_pandas", "recorded_variables", "result_of", "summary_of", "types_of"]
 
 _HELD = ("constant", "fixed", "tunable", "discrete")
 """Variabilities of variables whose values hold between two events."""
@@ -346,7 +346,7 @@ class Result(Mapping[str, NDArray[Any]]):
 
     @cached_property
     def _variables(self) -> dict[str, tuple[str, Variable]]:
-        return _recorded(self._system, self._record)
+        return recorded_variables(self._system, self._record)
 
     @cached_property
     def _columns(self) -> Columns:
@@ -489,7 +489,7 @@ def types_of(system: ResolvedSystem | None, record: int = 0) -> dict[str, Variab
     """The types of the variables in one of the result files by name; None without a system."""
     if system is None:
         return None
-    return {name: variable.type for name, (_, variable) in _recorded(system, record).items()}
+    return {name: variable.type for name, (_, variable) in recorded_variables(system, record).items()}
 
 
 def _titles(results: Sequence[Result]) -> list[str]:
@@ -503,7 +503,7 @@ def _titles(results: Sequence[Result]) -> list[str]:
     return [f"{result.title} ({number})" for number, result in enumerate(results, 1)]
 
 
-def _recorded(system: ResolvedSystem | None, record: int) -> dict[str, tuple[str, Variable]]:
+def recorded_variables(system: ResolvedSystem | None, record: int = 0) -> dict[str, tuple[str, Variable]]:
     """Instance and variable of each column of a result file, by its name."""
     columns: dict[str, tuple[str, Variable]] = {}
     if system is None:

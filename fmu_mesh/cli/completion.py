@@ -53,6 +53,7 @@ _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "BAG": ("mcap",),
     "FILE": _RESULTS,
     "FILE.png": ("png", "svg", "pdf"),
+    "FILE.csv": ("csv",),
     "FILE.svg": ("svg", "png", "pdf", "txt"),
     "FILE.mp4": ("mp4", "gif"),
     "FILE.json": ("json",),

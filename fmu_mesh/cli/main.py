@@ -32,6 +32,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
     "simulate": ("run", "free_running", "simulate one FMU to its end, as fast as possible; `run` keeps it live"),
     "run": ("run", "free_running", "run one FMU live until it is stopped; `simulate` runs it to its end"),
     "sweep": ("run", "sweep", "run a mesh many times with other values, into one table"),
+    "convergence": ("run", "sweep", "run a mesh with smaller and smaller steps, and estimate its error"),
     "new": ("file", "new_mesh", "write a configuration for FMUs, with suggested connections"),
     "check": ("run", "checking", "check a configuration and show its plan, without running it"),
     "graph": ("file", "graphing", "draw the graph of a configuration or of a running mesh"),

@@ -87,8 +87,8 @@ def _of_sweep(sweep: SweepResult, arguments: argparse.Namespace) -> tuple[Figure
     return sweep.plot(variables[0], colour=arguments.colour), variables[0]
 
 
-def check_plot(plot: Path, plan: RunPlan) -> None:
-    """Check before a run that its result can be plotted at its end.
+def check_plot(plot: Path, plan: RunPlan | None = None) -> None:
+    """Check before a run that its result, or without a plan another picture, can be drawn at its end.
 
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
@@ -99,6 +99,8 @@ def check_plot(plot: Path, plan: RunPlan) -> None:
     formats = FigureCanvasAgg.get_supported_filetypes()
     if plot.suffix.removeprefix(".").lower() not in formats:
         raise ConfigurationError(f"a plot cannot be written as '{plot}'.", hint="Name it .png, .svg or .pdf.")
+    if plan is None:
+        return
     if (result := plan.plan.system.result_file) is None:
         raise ConfigurationError("nothing is recorded, so there is nothing to plot.", hint="Name a file with --output.")
     if memory_of(plan) is None:

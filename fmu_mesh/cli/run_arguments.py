@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config.call_options import option_fields
-from ..run.options import SimulateOptions
+from ..run.options import ConvergenceOptions, SimulateOptions
 from ..sweeps.sweep_options import SweepOptions
 from .arguments import (
     ACCESS,
@@ -25,7 +25,7 @@ from .arguments import (
     switch,
     whole,
 )
-from .run_options import CONFIGURED, PLACED, add_options, options
+from .run_options import CONFIG, CONFIGURED, PLACED, add_options, options
 
 __all__ = ["HERE", "PARSERS", "SIMULATION"]
 
@@ -58,6 +58,10 @@ def _add_target(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("-o", "--to", metavar="FILE", help=text, type=Path, dest="target")
 
 
+_FOR_ALL_RUNS = group(
+    "instead of what CONFIG says, for all runs",
+    options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
+)
 _SLURM_OPTION = argument(
     "--slurm-option",
     "OPTION",
@@ -227,11 +231,19 @@ PARSERS: Parsers = {
             _SLURM_OPTION,
             switch("--no-wait", text="submit only; the same command follows it later"),
         ),
-        group(
-            "instead of what CONFIG says, for all runs",
-            options("algorithm", "step_size", "stop_time", "start_values", "config_values"),
-        ),
+        _FOR_ALL_RUNS,
         options("state", "replaced", "keys_from", "allow_code"),
+        *_OUTPUT,
+        json_switch("print what came out as one JSON object, and nothing else on standard output"),
+    ),
+    "convergence": (
+        *CONFIG,
+        options("halvings", of=ConvergenceOptions),
+        argument("--output", "FILE.csv", "write the table into this file", type=Path),
+        argument("--plot", "FILE.png", "draw errors over the step size and over the number of steps", type=Path),
+        group("how it runs", options("workers", "folder", "resume", "force", of=ConvergenceOptions)),
+        _FOR_ALL_RUNS,
+        options("allow_code"),
         *_OUTPUT,
         json_switch("print what came out as one JSON object, and nothing else on standard output"),
     ),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..api.mesh_builder import Mesh
     from ..config.yaml_text import Plain
 
-__all__ = ["CONFIGURED", "PLACED", "add_options", "forwarded", "given_options", "mesh_of", "options"]
+__all__ = ["CONFIG", "CONFIGURED", "PLACED", "add_options", "forwarded", "given_options", "mesh_of", "options"]
 
 
 def mesh_of(arguments: argparse.Namespace) -> Mesh:
@@ -71,10 +71,11 @@ def options(*names: str, of: type[CallOptions] = RunOptions, **words: Mapping[st
     return lambda parser: add_options(parser, *names, options=of, **words)
 
 
-_CONFIG = (
+CONFIG = (
     argument("config", "CONFIG", "a configuration file, a package of SSP, or a world of Gazebo", type=Path),
     *PACKAGE,
 )
+"""The argument CONFIG, and what chooses a variant of a package."""
 _INSTEAD = (
     "algorithm",
     "step_size",
@@ -89,12 +90,12 @@ _INSTEAD = (
 _ACCESS = ("security", "insecure")
 _TITLE = "instead of what CONFIG says"
 CONFIGURED = (
-    *_CONFIG,
+    *CONFIG,
     group(_TITLE, options(*_INSTEAD, "listen", "connect", *_ACCESS)),
     options("keys_from", "allow_code"),
 )
 """The argument CONFIG, and the flags that replace what CONFIG says."""
-PLACED = (*_CONFIG, group(_TITLE, options(*_INSTEAD, *_ACCESS)), options("keys_from", "allow_code"))
+PLACED = (*CONFIG, group(_TITLE, options(*_INSTEAD, *_ACCESS)), options("keys_from", "allow_code"))
 """As `CONFIGURED`, where an engine says how processes meet."""
 
 

@@ -1,4 +1,4 @@
-"""`sweep`: many runs of one mesh with other values, into one table."""
+"""`sweep` and `convergence`: many runs of one mesh with other values, into one table."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import Literal
 import msgspec
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
+from ..pictures.drawing import draw
+from ..run.options import ConvergenceOptions
+from ..sweeps.convergence import converging
 from ..sweeps.dask_cluster import dask_executor
 from ..sweeps.planned_sweep import PlannedSweep, continued_sweep, planned_sweep
 from ..sweeps.slurm_sweep import SlurmSweep
@@ -20,9 +23,11 @@ from ..sweeps.variants import Values, read_values
 from ..sweeps.worker_server import prepare_workers
 from ..text import short_path, shown
 from .arguments import Runs
-from .output.json_output import Failure, failure_of, print_json
+from .output.flag_words import in_flags
+from .output.json_output import Failure, failure_of, print_failure, print_json
 from .output.progress import ProgressLine, sweep_parts
 from .output.terminal import error_console, say, stdout_as_stderr
+from .plotting import check_plot
 from .run_arguments import HERE
 from .run_options import given_options, mesh_of
 from .running import interrupted_by_signals
@@ -175,4 +180,32 @@ def _show(sweep: Sweep) -> None:
     print(f"{runs}, in {progress.seconds:.3f} s{rate}")
 
 
-RUNS: Runs = {"sweep": _sweep}
+def _convergence(arguments: argparse.Namespace) -> int:
+    try:
+        if arguments.plot is not None:
+            check_plot(arguments.plot)
+        with stdout_as_stderr() if arguments.json else nullcontext():
+            options = ConvergenceOptions(**given_options(arguments, ConvergenceOptions))
+            with converging(mesh_of(arguments), options) as (runs, end), interrupted_by_signals() as running:
+                running.append(runs)
+                _follow(runs, arguments)
+                found = end()
+            if arguments.output is not None:
+                found.to_csv(arguments.output)
+            if arguments.plot is not None:
+                draw(found.plot(), arguments.plot)
+    except FmuMeshError as error:
+        if arguments.json:
+            print_failure(error)
+        raise
+    if arguments.json:
+        print_json(found)
+        return 0
+    print(in_flags(str(found)))
+    for what, file in (("table", arguments.output), ("plot", arguments.plot)):
+        if file is not None:
+            print(f"{what}: {file}")
+    return 0
+
+
+RUNS: Runs = {"sweep": _sweep, "convergence": _convergence}

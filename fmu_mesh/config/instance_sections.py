@@ -309,6 +309,10 @@ class InstanceSection:
         """In a few words what computes the model, for the page of `fmu-mesh check`."""
         return description.generation_tool or key_of(self)
 
+    def other_kind(self, description: ModelDescription) -> str | None:  # noqa: ARG002  for kinds with a choice
+        """What else the model could be used as, as the end of a sentence; None without a choice, or once it is made."""
+        return None
+
     def stateless(self, description: ModelDescription) -> str | None:
         """Why the state of an instance cannot outlive its process, as the end of a sentence; None if it can."""
         return None if description.can_serialize_state else f"`{key_of(self)}` has none that can be written"

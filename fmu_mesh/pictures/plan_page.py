@@ -78,13 +78,15 @@ def _head(plan: Plan) -> list[str]:
 
 
 def _instances(plan: Plan) -> list[str]:
-    rows = []
+    rows, notes = [], []
     for name, own in plan.system.instances.items():
-        summary = plan.system.config.instances[name].summary(own.description)
+        section = plan.system.config.instances[name]
+        summary, other = section.summary(own.description), section.other_kind(own.description)
+        notes += [f"  {name} {other}"] if other is not None else []
         model = f"{Path(own.fmu).name or own.description.model_name} ({summary})"
         step = f"step {short_number(own.step_points * plan.grid.step_size)} s"
         rows.append([name, model, step, "a process of its own" if own.node == name else f"group {own.node}"])
-    return table(rows, indent=2)
+    return [*table(rows, indent=2), *notes]
 
 
 def _hosts(plan: Plan) -> list[str]:

@@ -14,13 +14,18 @@ if TYPE_CHECKING:
 __all__ = [
     "BatchOptions",
     "BeginOptions",
+    "ConvergenceOptions",
     "OpenOptions",
     "PlanOptions",
     "RerunOptions",
     "RunOptions",
     "SimulateOptions",
     "StartOptions",
+    "State",
+    "SweepForce",
+    "SweepResume",
     "VariantOptions",
+    "Workers",
 ]
 
 Values = Mapping[str, Any] | Iterable[Any] | None
@@ -50,9 +55,13 @@ Resume = Annotated[
 State = Annotated[
     File, Option("begin with this state, which `System.save` or `Run.checkpoint` has written", "--from", "FILE")
 ]
+Workers = Annotated[int | None, Option("processes of this host; None: one per processor", "--workers", "N", least=1)]
+SweepResume = Annotated[bool, Option("keep the runs that the folder has, and run what is missing", "--resume")]
+SweepForce = Annotated[bool, Option("remove the sweep that the folder has, and no other files", "--force")]
 OnProgress = Annotated[Callable[["MeshStatus"], object] | None, Option("called about ten times per second")]
 OnEvent = Annotated[Callable[["Event"], object] | None, Option("called with every event of `fmu_mesh.run.events`")]
 MEMORY_LIMIT = 2**30
+_MOST_HALVINGS = 6
 
 
 class VariantOptions(CallOptions, frozen=True, kw_only=True):
@@ -70,6 +79,25 @@ class VariantOptions(CallOptions, frozen=True, kw_only=True):
     ] = None
     allow_code: AllowCode = False
     on_notice: OnNotice = None
+
+
+class ConvergenceOptions(VariantOptions, frozen=True, kw_only=True):
+    """What `Mesh.convergence` takes."""
+
+    halvings: Annotated[
+        int, Option(f"how often the step size is halved, 1 to {_MOST_HALVINGS}; default: 2", "--halvings", "N", least=1)
+    ] = 2
+    workers: Workers = None
+    folder: Annotated[
+        File, Option("keep the runs in this folder, as a sweep; default: they are removed", "--folder", "FOLDER")
+    ] = None
+    resume: SweepResume = False
+    force: SweepForce = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.halvings > _MOST_HALVINGS:
+            raise CallRefused(f"`halvings={self.halvings}`: expected a whole number from 1 to {_MOST_HALVINGS}")
 
 
 class BeginOptions(VariantOptions, frozen=True, kw_only=True):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ..config.call_options import Option
-from ..run.options import BeginOptions
+from ..run.options import BeginOptions, SweepForce, SweepResume, Workers
 
 if TYPE_CHECKING:
     from ..api.result import Result
@@ -27,9 +27,7 @@ class SweepOptions(BeginOptions, frozen=True, kw_only=True):
             "processes of this host"
         ),
     ] = None
-    workers: Annotated[
-        int | None, Option("processes of this host; None: one per processor", "--workers", "N", least=1)
-    ] = None
+    workers: Workers = None
     sampler: Annotated[
         str | None,
         Option(
@@ -56,8 +54,8 @@ class SweepOptions(BeginOptions, frozen=True, kw_only=True):
         Option("folder of the sweep; default: MESH_sweep beside the result file", "--folder", "FOLDER"),
     ] = None
     curves: Annotated[bool, Option("False: keep the table only", "--no-curves")] = True
-    resume: Annotated[bool, Option("keep the runs that the folder has, and run what is missing", "--resume")] = False
-    force: Annotated[bool, Option("remove the sweep that the folder has, and no other files", "--force")] = False
+    resume: SweepResume = False
+    force: SweepForce = False
     processes: Annotated[bool, Option("deprecated: run each variant in processes, as `Mesh.run` does")] = False
     reset: Annotated[bool, Option("reset the instances of FMUs between two runs (fmi2Reset)", "--reset")] = False
     max_instances: Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,8 @@ import pytest
 
 import fmu_mesh
 from fmu_mesh.config.call_options import CallOptions, option_fields
-from fmu_mesh.run.options import OpenOptions, PlanOptions, RunOptions, SimulateOptions
+from fmu_mesh.run.options import ConvergenceOptions, OpenOptions, PlanOptions, RunOptions, SimulateOptions
+from fmu_mesh.sweeps import worker_server
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 from tests.helpers import FMUS, write_config
 
@@ -59,8 +60,17 @@ RIGHT: Mapping[str, Any] = {
     "force": True,
     "reset": True,
     "max_instances": {"DampedPendulum.fmu": 2},
+    "halvings": 1,
 }
 """A value of each option with which a call works."""
+
+
+@pytest.fixture(autouse=True)
+def server_of_workers(folder: Path) -> Iterator[None]:  # noqa: ARG001 in which nothing may be left
+    """The server of a study stays for the next one of the program: it ends here with each test."""
+    yield
+    while worker_server._ready:
+        worker_server._ready.pop().close()
 
 
 class Nowhere(Executor):
@@ -115,6 +125,12 @@ CALLS = {
     "open": Call(OpenOptions, opened, {}, {**RIGHT, "keys_from": None}),
     "simulate": Call(SimulateOptions, simulated, {**SHORT, "step_size": 0.002}, {**RIGHT, **OF_ONE_FMU}),
     "sweep": Call(SweepOptions, swept, {"stop_time": 0.004, "executor": Nowhere()}),
+    "convergence": Call(
+        ConvergenceOptions,
+        fmu_mesh.Mesh.convergence,
+        {"stop_time": 0.004, "workers": 1},
+        {**RIGHT, "resume": False, "keys_from": None},
+    ),
 }
 WAYS: Mapping[str, Callable[[str], Any]] = {
     "numpy": lambda _: np.float64(0.5),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import fmu_mesh
 from fmu_mesh.cli.main import main
 from tests.fmus.helpers import FMUS, find_fmu
 from tests.fmus.packing import repacked, unpacked
@@ -166,3 +167,28 @@ def test_clocks_are_shown_with_their_times(event_fmu: Callable[..., Path], capsy
     page = inspected(capsys, event_fmu("Stairs", 3, clocks=clock))
 
     assert "tick (input, constant, every 0.4 s from 0.2 s on), stair (output, triggered)" in " ".join(page.split())
+
+
+def test_an_fmu_with_both_kinds_says_which_one_is_used(
+    tmp_path: Path, event_fmu: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    fmu = repacked(
+        tmp_path / "Both.fmu",
+        source=event_fmu("Ball", 2),
+        description=lambda text: text.replace('modelName="', 'generationTool="Modeller 3" modelName="', 1),
+    )
+    made, other = (
+        "its co-simulation was made by Modeller 3",
+        "`kind: model_exchange` is solved by us with tolerance 1e-06",
+    )
+    said = f"has both kinds; {made}; {other}"
+    mesh = fmu_mesh.Mesh.from_fmu(fmu, name="ball", simulation={"step_size": 0.01, "stop_time": 1.0})
+
+    page = inspected(capsys, fmu)
+
+    assert f"Used as co-simulation: it {said}" in " ".join(page.split())
+    assert f"\n  ball {said}\n" in mesh.check().page
+    for kind in ("co_simulation", "model_exchange"):  # chosen: there is nothing to say
+        chosen = fmu_mesh.Mesh.from_fmu(fmu, kind=kind, simulation={"step_size": 0.01, "stop_time": 1.0})
+        assert "has both" not in chosen.check().page
+    assert "Used as" not in inspected(capsys, PENDULUM)

@@ -31,7 +31,7 @@ def kept_points(run: RunPlan) -> list[int]:
 
 
 def write(run: RunPlan, *points: int) -> None:
-    keep = keeper(run)
+    keep = keeper(run, None)
     for point in points:
         keep(point, state_bytes(run, point, dict.fromkeys(run.contents, b"")))
 
@@ -39,7 +39,7 @@ def write(run: RunPlan, *points: int) -> None:
 def test_checkpoints_wait_for_rows_however_many_there_are(run: RunPlan) -> None:
     write(run, 100, 200, 300, 400, 500)
 
-    drop_older(run.kept_in, run.plan.system.records, [Kept(rows=250)])
+    drop_older(run.kept_in, run.plan, [Kept(rows=250)], 0)
 
     assert kept_points(run) == [200, 300, 400, 500]
     again = again_from_checkpoint(run, run.kept_in, [250])
@@ -49,7 +49,7 @@ def test_checkpoints_wait_for_rows_however_many_there_are(run: RunPlan) -> None:
 def test_no_checkpoint_goes_before_there_are_rows(run: RunPlan) -> None:
     write(run, 100, 200, 300)
 
-    drop_older(run.kept_in, run.plan.system.records, [Kept()])
+    drop_older(run.kept_in, run.plan, [Kept()], 0)
 
     assert kept_points(run) == [100, 200, 300]
     assert again_from_checkpoint(run, run.kept_in, [0]).plan.grid.first_point == 0
@@ -68,7 +68,7 @@ def test_a_checkpoint_that_is_being_written_is_left_alone(run: RunPlan) -> None:
     draft = run.kept_in / f"300.unfinished{STATE}"
     draft.write_bytes(b"FMUSTATE")
 
-    drop_older(run.kept_in, run.plan.system.records, [Kept(rows=1000)])
+    drop_older(run.kept_in, run.plan, [Kept(rows=1000)], 0)
 
     assert draft.exists()
     assert again_from_checkpoint(run, run.kept_in, [1000]).plan.grid.first_point == 200

@@ -108,7 +108,7 @@ def test_the_version_imports_this_much_of_the_package_and_little_else() -> None:
         (("launch", "a.yaml", "--json", "--plto", "x"), "Did you mean '--plot'?"),
         (
             ("check", "a.yaml", "--json", "--plot", "x.png"),
-            "It is an option of `launch`, `simulate`, `compare`, `master`.",
+            "It is an option of `launch`, `simulate`, `convergence`, `compare`, `master`.",
         ),
         (("lunch", "--json"), "Did you mean 'launch'?"),
         (("--json", "launch", "a.yaml"), "It comes after the command: `fmu-mesh launch --json`."),

@@ -264,7 +264,6 @@ SPELLS_FLAGS = {
     "hosts/processes.py": "commands that an engine runs",
     "hosts/slurm.py": "options of sbatch",
     "hosts/slurm_mesh.py": "options of sbatch, and of a command that a job runs",
-    "sweeps/sweep_options.py": "as `run/options.py`",
     "sweeps/slurm_array.py": "options of sbatch",
     "sweeps/slurm_sweep.py": "a command that the tasks of a job run",
     "__main__.py": "it reads the command line",

@@ -14,7 +14,7 @@ from fmu_mesh.cli.main import COMMANDS
 from fmu_mesh.config.call_options import CallOptions, option_fields
 from fmu_mesh.config.findings import Findings
 from fmu_mesh.config.structure import check
-from fmu_mesh.run.options import RunOptions, SimulateOptions
+from fmu_mesh.run.options import ConvergenceOptions, RunOptions, SimulateOptions
 from fmu_mesh.sweeps.planned_sweep import SweepOptions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -104,7 +104,7 @@ def test_every_option_says_since_when_it_is_there(pages: ModuleType) -> None:
     assert [" ".join(pair) for pair in options if not pages.since(*pair)] == [], "see keys.yaml"
 
 
-@pytest.mark.parametrize("options", [RunOptions, SimulateOptions, SweepOptions])
+@pytest.mark.parametrize("options", [RunOptions, SimulateOptions, SweepOptions, ConvergenceOptions])
 def test_every_option_in_python_has_an_example_that_is_taken(pages: ModuleType, options: type[CallOptions]) -> None:
     fields = option_fields(options)
     said = {name: pages.said(options, name) for name in fields}

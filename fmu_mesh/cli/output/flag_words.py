@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 
 from ...config.call_options import option_fields
-from ...run.options import RunOptions, SimulateOptions
+from ...run.options import ConvergenceOptions, RunOptions, SimulateOptions
 from ...sweeps.sweep_options import SweepOptions
 
 __all__ = ["in_flags"]
 
 _FLAGS = {name: f"--{name}" for name in ("port", "ssd", "ssv", "start", "timeout", "vary", "version")} | {
     name: field.flag
-    for options in (SimulateOptions, SweepOptions, RunOptions)
+    for options in (SimulateOptions, ConvergenceOptions, SweepOptions, RunOptions)
     for name, field in option_fields(options).items()
     if field.flag
 }

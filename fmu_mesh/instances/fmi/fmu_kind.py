@@ -178,6 +178,14 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             solver = f" model exchange, {settings.name}{tolerance}"
         return f"FMI {description.fmi_version}{solver}"
 
+    def other_kind(self, description: ModelDescription) -> str | None:
+        """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""
+        if self.kind != "auto" or len(description.kinds) < 2:
+            return None
+        made = f"its co-simulation was made by {description.generation_tool or 'a tool that it does not name'}"
+        tolerance = self.solver_settings(description).relative_tolerance
+        return f"has both kinds; {made}; `kind: model_exchange` is solved by us with tolerance {tolerance:g}"
+
     def stateless(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: what the FMU says of itself, and whether the solver has a history."""
         if description.fmi_version.startswith("1."):
