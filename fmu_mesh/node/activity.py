@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from ..awake import AwakeClock
 from ..errors import FmuMeshError, Interrupted, MeshLost, StepFailed
@@ -13,6 +13,7 @@ from ..instances.call_guard import not_returned
 from ..system.attempt import Attempt
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
+from ..wire.solved_loop import SolvedLoop
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.views import WAITING, InstanceStatus, LogLine
 from ..wire.ways import Ways
@@ -38,6 +39,7 @@ class Activity:
         self.state = "starting"
         self.runners: Mapping[str, Runner] = {}
         self.ways: Ways | None = None
+        self.loops: Sequence[SolvedLoop] = ()
         self._plan = plan
         self._refusals = refusals
         self._started = 0.0
@@ -57,9 +59,9 @@ class Activity:
         """All instances are loaded; these are the keys at ends of their connections, in this attempt of the run."""
         self.runners, self._keys, self._attempt = runners, keys, attempt
 
-    def steps_with(self, engine: Engine, ways: Ways, keeper: StreamKeeper | None) -> None:
-        """The instances are at their first point, and this engine steps them; the keeper is that of its row streams."""
-        self.ways, self._keeper = ways, keeper
+    def steps_with(self, engine: Engine, ways: Ways, keeper: StreamKeeper | None, loops: Sequence[SolvedLoop]) -> None:
+        """The instances are at their first point; the keeper is that of row streams, and the loops have been solved."""
+        self.ways, self._keeper, self.loops = ways, keeper, loops
         self._started = time.monotonic()
         self._engine = engine
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -30,6 +30,7 @@ from ..wire.host_processes import own_pid
 from ..wire.inbox import Inbox
 from ..wire.keys import BY, Keys, VariableKind, escape, sender_in, unescape
 from ..wire.messages import SetValue, decode_json
+from ..wire.solved_loop import SolvedLoop
 from ..wire.values import (
     NO_ORIGIN,
     Origin,
@@ -127,7 +128,7 @@ class Answers:
             return
         views: dict[str, Callable[[], object]] = {"status": lambda: self._activity.status(name)}
         if runner is not None:
-            views["info"] = lambda: instance_info(self._plan, runner, self._activity.ways)
+            views["info"] = lambda: instance_info(self._plan, runner, self._activity.ways, self._activity.loops)
         for what, view in views.items():
             if query.key_expr.intersects(zenoh.KeyExpr(f"{root}/{what}")):
                 query.reply(f"{root}/{what}", msgspec.json.encode(view()), encoding=json_encoding)
@@ -373,7 +374,7 @@ class _Pending:
         self.finish(partial(self.query.reply_err, reason))
 
 
-def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> InstanceInfo:
+def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None, loops: Sequence[SolvedLoop]) -> InstanceInfo:
     """What `info` answers for an instance of this process."""
     description, start_values = runner.instance.description, runner.plan.start_values
     sources, timeouts = runner.plan.sources, {own.variable: str(own) for own in runner.plan.timeouts}
@@ -439,4 +440,5 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None) -> Instance
         clocks=description.clocks,
         keys=key_views(runner.name, *runner.plan.keys_in, *runner.plan.keys_out),
         deploy_host=plan.host or "",
+        loops=tuple(own for own in loops if any(name.startswith(f"{runner.name}.") for name in own.outputs)),
     )

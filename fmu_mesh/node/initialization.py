@@ -24,6 +24,8 @@ from ..system.layout import Column
 from ..system.plan import InstancePlan, Link, NodePlan
 from ..variables.value_types import PlainValue, Value, split_element
 from ..wire.frames import initial_values
+from ..wire.messages import Noted
+from ..wire.solved_loop import SolvedLoop
 from .links import OutLink
 from .stepping import Runner
 
@@ -52,11 +54,15 @@ class _Move(NamedTuple):
 class Initialization:
     """Sets inputs and gets outputs while all instances of a node are in Initialization Mode.
 
-    ``wait`` waits for a message for at most this time in s, and handles it; None: there are no other nodes. The
-    ``out_links`` are those that are needed only during Initialization Mode.
+    ``wait`` waits for a message for at most this time in s, and handles it; None: there are no other nodes.
+
+    Attributes:
+        out_links: those that are needed only during Initialization Mode.
+        solved: how loops were solved in which this node takes part.
     """
 
     def __init__(self, plan: NodePlan, wait: Callable[[float], None] | None = None) -> None:
+        self.solved: list[SolvedLoop] = []
         self.out_links: list[OutLink] = []
         self._plan = plan
         self._wait = wait or _nothing_comes
@@ -84,6 +90,14 @@ class Initialization:
         self._settled: set[Key] = set()
         self._parameters: dict[Key, str] = {}
         self._clock, self._end = AwakeClock(), 0.0
+
+    @property
+    def noted(self) -> list[Noted]:
+        """How loops were solved, for the metadata of results: that of a loop at the instance of its first output."""
+        own: dict[str, list[str]] = {item.name: [] for item in self._plan.instances}
+        for loop in self.solved:
+            own.get(loop.outputs[0].partition(".")[0], []).append(str(loop))
+        return [Noted("loops", name, 0, "; ".join(loops)) for name, loops in own.items() if loops]
 
     def take(self, link: Link, tag: int, data: bytes) -> None:
         """Store an INITIAL message of another node."""
@@ -119,6 +133,7 @@ class Initialization:
             stop_time = self._stop_times[runner.plan.step_points]
             runner.instance.enter_initialization(start_time, stop_time, {**own, **others} if others else own)
         self._end = self._clock() + self._plan.timeouts.initialize
+        self.solved = []
         for level in self._sequence:
             if level in self._loops:
                 self._iterate(self._loops[level], runners)
@@ -167,6 +182,7 @@ class Initialization:
                 if k[2] is None or k[:2] not in members or (k[2] > sweep and not consistent)
             }
         self._settled |= point.assumed.keys()
+        self.solved.append(SolvedLoop(tuple(map(".".join, loop.outputs)), point.sweeps, point.residual))
         for runner, level, names in own:
             self._send(runner, level, {name: self._known[runner.name, name, None] for name in names}, loop)
 

@@ -317,12 +317,12 @@ class Node:
             plan, units, self._memory, self._windows(), spins=not ONE_CORE, streams=self._streams
         )
         self._inbox.move_to(self._memory, engine)
-        self._activity.steps_with(engine, self._ways, self._keeper)
+        self._activity.steps_with(engine, self._ways, self._keeper, self._initialization.solved)
         for runner in self._runners.values():
             runner.begin()
             runner.flush()
         set_again(self._begins_with, self._runners)
-        for news in self._journal.entries():  # it belongs to the metadata of this attempt, too
+        for news in (*self._initialization.noted, *self._journal.entries()):  # for the metadata of this attempt
             self._put_set(encode_news(news))
         self.server.started()
         self._memory.progress[plan.node].raise_to(engine.covered + 1)

@@ -180,7 +180,7 @@ class RecordFiles:
         self._each(lambda own: own.file.note(entry))
 
     def note_event(self, what: str, instance: str, point: int, message: str) -> None:
-        """Add to the metadata at which point an instance was found to be stiff, or has failed and is held or disabled.
+        """Add to the metadata what has turned out at a point: see `Noted`.
 
         The errors are those of `write`.
         """

@@ -64,6 +64,7 @@ class HostedSystem:
     Attributes:
         plan: the plan.
         runners: the instances, by name.
+        initialization: what it has found, once `begin` has returned.
         loads: whether the next `open` opens instances, and does not use those that are there.
     """
 
@@ -93,7 +94,7 @@ class HostedSystem:
         self._state: ProcessState | None = None
         self._begins_with = begins_with or BeginsWith()
         self._begins_again, self._names = begins_with is None, ", ".join(plan.order)
-        self._initialization = Initialization(node)
+        self.initialization = Initialization(node)
 
     def open(self) -> None:
         """Open all instances; after `end`, they begin again.
@@ -129,7 +130,7 @@ class HostedSystem:
             FmuError: an instance cannot be initialized.
         """
         node, engine = self.node, self._engine
-        self._initialization.run(self.runners.values(), start_values, again=engine is not None)
+        self.initialization.run(self.runners.values(), start_values, again=engine is not None)
         load_states(self._begins_with, self.runners)
         if engine is None:
             units = [[self.runners[name] for name in self.plan.order]]  # called in this order at each point

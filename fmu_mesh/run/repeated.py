@@ -23,7 +23,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from ..config.mesh import TimeoutsConfig
 from ..errors import ConfigurationError, FmuError, FmuMeshError, Interrupted, TerminationRequested
@@ -339,6 +339,8 @@ class _Run:
         try:
             self._engine = engine = self._system.begin(start_values)
             self.writer.begin(self._plan, self._system.runners)
+            for noted in self._system.initialization.noted:
+                self.writer.note_event(*astuple(noted))
             started = time.perf_counter()
             try:
                 with watch.stepping(self._position, self.timeouts.step):
@@ -355,9 +357,8 @@ class _Run:
         """How a run ended that did not fail."""
         if self._end is not None:
             return self._end
-        files, warnings = self.writer.counted, self.writer.warnings
-        own = self._plan, self.point, files, None, self._asked
-        self._end = outcome_at(*own, seconds=self._seconds, warnings=warnings)
+        own = self._plan, self.point, self.writer.counted, None, self._asked
+        self._end = outcome_at(*own, seconds=self._seconds, warnings=self.writer.warnings)
         return self._end
 
     def _leave(self, *, failed: bool) -> None:

@@ -130,7 +130,7 @@ class InstanceState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Noted(msgspec.Struct, frozen=True):
-    """What has turned out in the step from a point, see `LogMessage.noted`, and what was said then."""
+    """What has turned out in the step from a point, see `LogMessage.noted` and `Initialization.noted`, in words."""
 
     what: str
     instance: str

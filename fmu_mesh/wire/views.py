@@ -14,6 +14,7 @@ from ..simtime import ENDLESS
 from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
+from .solved_loop import SolvedLoop
 
 __all__ = [
     "GOING_ON",
@@ -138,6 +139,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
 
     Attributes:
         host: the name that the system has; ``deploy_host``: the one in `deploy.hosts`, empty where `launch` runs.
+        loops: how the algebraic loops with outputs of this instance were solved at the start.
     """
 
     instance: str
@@ -159,6 +161,7 @@ class InstanceInfo(msgspec.Struct, frozen=True):
     clocks: tuple[Clock, ...] = ()
     keys: tuple[KeyView, ...] = ()
     deploy_host: str = ""
+    loops: tuple[SolvedLoop, ...] = ()
 
     def __repr__(self) -> str:
         counts = f"{counted(len(self.variables), 'variable')}, {counted(len(self.connections), 'connection')}"

@@ -180,6 +180,7 @@ def instance_info(info: InstanceInfo) -> list[str]:
             ("node", f"{info.node}{_on(info.deploy_host)}, process {info.pid} on {info.host}"),
             ("fed by", ", ".join(map(_connection, info.connections))),
             *(("key", "  ".join(own.cells)) for own in info.keys),
+            *(("loop", str(own)) for own in info.loops),
             ("timeouts", ", ".join(f"{v.name}: {v.timeout}" for v in info.variables if v.timeout)),
             ("clocks", ", ".join(map(str, info.clocks))),
             ("problems", "; ".join(info.problems)),
