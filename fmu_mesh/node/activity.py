@@ -13,6 +13,7 @@ from ..instances.call_guard import not_returned
 from ..system.attempt import Attempt
 from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
+from ..wire.solved_loop import SolvedLoop
 from ..wire.stream_keeper import StreamKeeper
 from ..wire.views import WAITING, InstanceStatus, LogLine, SolvedLoop
 from ..wire.ways import Ways

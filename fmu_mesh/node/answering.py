@@ -30,6 +30,7 @@ from ..wire.host_processes import own_pid
 from ..wire.inbox import Inbox
 from ..wire.keys import BY, Keys, VariableKind, escape, sender_in, unescape
 from ..wire.messages import SetValue, decode_json
+from ..wire.solved_loop import SolvedLoop
 from ..wire.values import (
     NO_ORIGIN,
     Origin,

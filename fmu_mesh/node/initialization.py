@@ -27,7 +27,7 @@ from ..system.states import BeginsWith
 from ..variables.value_types import PlainValue, Value, split_element
 from ..wire.frames import initial_values
 from ..wire.messages import Noted
-from ..wire.views import SolvedLoop
+from ..wire.solved_loop import SolvedLoop
 from .links import OutLink
 from .stepping import Runner
 

@@ -114,7 +114,6 @@ class OpenOptions(BeginOptions, frozen=True):
     """What `Mesh.open` takes."""
 
     start_values: StartValues = None
-    state: State = None
 
 
 class BatchOptions(VariantOptions, frozen=True):

@@ -14,6 +14,7 @@ from ..simtime import ENDLESS
 from ..text import counted, walk
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
+from .solved_loop import SolvedLoop
 
 __all__ = [
     "GOING_ON",

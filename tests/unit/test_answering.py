@@ -96,7 +96,7 @@ class Query:
 
 @pytest.mark.parametrize("state", ["waiting for the mesh", "initializing"])
 def test_a_query_before_first_point_waits_for_it_and_not_for_ever(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answering, "instance_info", lambda _plan, _runner, _ways: 5)
+    monkeypatch.setattr(answering, "instance_info", lambda _plan, _runner, _ways, _loops: 5)
     ring = Ring(Layout.of([("y", "Float64")]), ROWS)
     ring.put(0, "y", 2.5)
     description = SimpleNamespace(variables=[Y], variable={"y": Y}.get)
@@ -107,7 +107,7 @@ def test_a_query_before_first_point_waits_for_it_and_not_for_ever(state: str, mo
         instance=SimpleNamespace(description=description),
         plan=SimpleNamespace(step_points=1),
     )
-    activity = SimpleNamespace(state=state, runners={"unit": runner}, ways=None, status=lambda _name: 7)
+    activity = SimpleNamespace(state=state, runners={"unit": runner}, ways=None, loops=(), status=lambda _name: 7)
     plan = SimpleNamespace(key_prefix="fmu_mesh", mesh="lab", grid=TimeGrid(0.0, 0.1, 10))
     none = cast("Any", None)
     answers = Answers(cast("Any", plan), none, cast("Any", activity), none, none, none)
