@@ -330,9 +330,7 @@ def queue_again(cluster: SlurmCluster, config: Path) -> None:
     wait_until(lambda: [*config.with_name("kept").glob("*.state")], "a checkpoint")
     [job] = cluster.jobs()
     cluster.ask("scontrol", "requeue", job)
-    wait_until(lambda: "PENDING" in cluster.ask("squeue", "--noheader", "--format=%T"), "the job in the queue")
-    # Slurm waits for two minutes. In the second of its end, a host refuses it: "job credential revoked".
-    cluster.ask("scontrol", "update", f"JobId={job}", "StartTime=now+3")
+    cluster.begin_again(job)
 
 
 @needs_slurm

@@ -12,7 +12,9 @@ import shutil
 import signal
 import socket
 import subprocess
+import time
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -116,6 +118,19 @@ class SlurmCluster:
     def jobs(self) -> list[str]:
         """The numbers of the jobs that wait or run."""
         return sorted(set(self.ask("squeue", "--noheader", "--array", "--format=%F").split()))
+
+    def begin_again(self, job: str) -> None:
+        """Let a job that was queued again begin; Slurm would wait for two minutes.
+
+        It is pending at once, and waits for its time when its host has let go of it; before, an update ends it. In the
+        second of its end, the host refuses to start it: "Job credential revoked". A later time than now would wait for
+        the next round of the controller, which comes once a minute.
+        """
+        reason = partial(self.ask, "squeue", "--noheader", "--jobs", job, "--format", "%r")
+        wait_until(lambda: "BeginTime" in reason(), f"job {job} in the queue")
+        another_second = time.time() + 1.5
+        wait_until(lambda: time.time() > another_second, "another second")
+        self.ask("scontrol", "update", f"JobId={job}", "StartTime=now")
 
     def cancel_all(self) -> None:
         """Cancel what a test has left, and wait until it has ended."""
