@@ -15,7 +15,7 @@ from ..system.plan import NodePlan
 from ..wire.refusals import Refusals
 from ..wire.solved_loop import SolvedLoop
 from ..wire.stream_keeper import StreamKeeper
-from ..wire.views import WAITING, InstanceStatus, LogLine, SolvedLoop
+from ..wire.views import WAITING, InstanceStatus, LogLine
 from ..wire.ways import Ways
 from .engine import Engine
 from .inputs import TimedInputs

@@ -42,7 +42,7 @@ from ..wire.values import (
     json_encoding,
     who_sent,
 )
-from ..wire.views import AuditEntry, ConnectionView, InstanceInfo, LogLine, SetAnswer, SolvedLoop, VariableView, Way
+from ..wire.views import AuditEntry, ConnectionView, InstanceInfo, LogLine, SetAnswer, VariableView, Way
 from ..wire.ways import Ways
 from .activity import Activity
 from .inputs import set_input

@@ -154,8 +154,7 @@ def planned(
     loaded, findings = examine_data(with_options(values, options), dict(options.start_values or {}))
     folder = loaded.file.absolute().parent  # paths become absolute where a section names other files than its model
     located = {name: section.located(folder) for name, section in loaded.config.instances.items()}
-    security = loaded.config.security
-    if security is not None:
+    if (security := loaded.config.security) is not None:
         security = replace(security, folder=str(folder / security.folder))
     loaded = replace(loaded, config=replace(loaded.config, instances=located, security=security))
     showing = Showing(view=options.view, video=Path(options.video).absolute() if options.video else None)
@@ -177,10 +176,9 @@ def planned(
         ros = resolve(loaded, descriptions, findings, warnings)
         topics = ros.listed if ros is not None else ()
     scenario = _scenario(loaded, descriptions, findings)
-    sections = located
 
     def claimed(name: str) -> Claims:
-        own = placed(sections[name])
+        own = placed(located[name])
         path = loaded.resolve(own.path) if own.path else Path()
         return known.claims(path, own, descriptions[name], loaded.config.limits)
 
@@ -190,9 +188,9 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
-    system = with_feedthrough(system, sections, loaded.findings(), warnings)
+    system = with_feedthrough(system, located, loaded.findings(), warnings)
     _check_host(loaded.config, obstacles, warnings)
-    contents = {name: content(Path(own.fmu), sections[name]) for name, own in system.instances.items()}
+    contents = {name: content(Path(own.fmu), located[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
     warn_of_start_values(system, plan.initialization.loops, warnings)

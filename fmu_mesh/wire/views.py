@@ -11,7 +11,7 @@ from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
-from ..text import counted, walk
+from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
 from .solved_loop import SolvedLoop
@@ -35,7 +35,6 @@ __all__ = [
     "RosTopicView",
     "RosView",
     "SetAnswer",
-    "SolvedLoop",
     "VariableView",
     "Way",
 ]
@@ -133,24 +132,6 @@ class KeyStatus(KeyView, frozen=True):
         counts = (f"{count} {name}" for name, count in troubles.items() if count)
         silent = [f"silent for {self.age:.0f} s"] if self.age >= 1.0 else []
         return ", ".join([f"{self.rate:.3g}/s", *counts, *silent])
-
-
-class SolvedLoop(msgspec.Struct, frozen=True):
-    """How an algebraic loop was solved at the start.
-
-    Attributes:
-        outputs: its outputs, as `instance.output`, in the order in which they are computed.
-        residual: the largest difference that is left between a floating-point value and its source, as a fraction of
-            the value if that is above 1.
-    """
-
-    outputs: tuple[str, ...]
-    iterations: int
-    residual: float
-
-    def __str__(self) -> str:
-        after = counted(self.iterations, "iteration")
-        return f"{walk(self.outputs)} solved after {after}, residual {self.residual:.2g}"
 
 
 class InstanceInfo(msgspec.Struct, frozen=True):
