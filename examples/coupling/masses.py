@@ -1,4 +1,4 @@
-"""Two masses with springs and dampers, one component each: the dual mass oscillator that co-simulation tools are tried on.
+"""Two masses with springs and dampers, one component each: a dual mass oscillator, as co-simulation tools are tried on.
 
 Each component solves its own equation exactly for an input that is constant over the step. So all that is wrong in a
 result comes from the coupling.
@@ -13,12 +13,12 @@ from fmu_mesh import Input, Output, Parameter
 class Mass:
     """A mass of 1 kg on a spring and a damper: x'' = force - stiffness x - damping x'."""
 
-    def __init__(self, stiffness, damping, x):
+    def __init__(self, stiffness: float, damping: float, x: float) -> None:
         root = cmath.sqrt(damping**2 / 4 - stiffness)
         self.rates = -damping / 2 + root, -damping / 2 - root
         self.stiffness, self.x, self.v = stiffness, x, 0.0
 
-    def step(self, force, step_size):
+    def step(self, force: float, step_size: float) -> None:
         """Go on by a step with a constant force."""
         (r, s), rest = self.rates, force / self.stiffness
         a = (self.v - s * (self.x - rest)) / (r - s)
@@ -35,11 +35,13 @@ class Left(fmu_mesh.Component):
     x1 = Output(unit="m", depends_on=())
     v1 = Output(unit="m/s", depends_on=())
 
-    def initialize(self):
+    def initialize(self) -> None:
+        """The place of the mass at rest."""
         self.mass = Mass(10.0, 0.2, self.x1_0)
         self.x1, self.v1 = self.mass.x, 0.0
 
-    def step(self, time, step_size):
+    def step(self, time: float, step_size: float) -> None:
+        """Go on with the force of the coupling."""
         self.mass.step(self.force, step_size)
         self.x1, self.v1 = self.mass.x, self.mass.v
 
@@ -55,15 +57,17 @@ class Right(fmu_mesh.Component):
     x2 = Output(unit="m", depends_on=())
     force = Output(unit="N", depends_on=("x1", "v1"))
 
-    def initialize(self):
+    def initialize(self) -> None:
+        """The place of the mass at rest, and the first force."""
         self.mass = Mass(20.0 + self.k, 0.3 + self.d, self.x2_0)
         self.give()
 
-    def step(self, time, step_size):
+    def step(self, time: float, step_size: float) -> None:
+        """Go on with the place of the left mass, which belongs to the other side of spring and damper."""
         self.mass.step(self.k * self.x1 + self.d * self.v1, step_size)
         self.give()
 
-    def give(self):
+    def give(self) -> None:
         """The outputs after a step, or at the start."""
         self.x2 = self.mass.x
         self.force = self.k * (self.mass.x - self.x1) + self.d * (self.mass.v - self.v1)
