@@ -463,6 +463,11 @@ NOT_RUN = [
         "the mesh is yours; tests/property/test_branches.py does it with others",
     ),
     (
+        "docs/recovery.md",
+        "fmu-mesh launch plant.yaml --from at20s.state --replace pump --output results/other_pump.csv",
+        "as above; tests/property/test_replacing.py does it",
+    ),
+    (
         "docs/ros-node.md",
         "source /opt/ros/jazzy/setup.bash",
         "it needs a ROS with its commands; tests/ros/test_node.py starts this node and switches it",
