@@ -119,7 +119,7 @@ def _add_nodes(parser: argparse._ActionsContainer) -> None:
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
-        options("state", "paused", "view", "video", "profile", "processes", "restarts", "resume"),
+        options("state", "paused", "view", "video", "profile", "defects", "processes", "restarts", "resume"),
         _PLOT,
         *_OUTPUT,
         _OUTCOME,

@@ -197,7 +197,7 @@ def planned(
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
     warn_of_point_loops(plan, warnings)
-    plan = replace(plan, system=replace(system, warnings=(*system.warnings, *warnings), topics=topics))
+    plan = replace(plan, system=replace(plan.system, warnings=(*system.warnings, *warnings), topics=topics))
     run = RunPlan(
         loaded,
         plan,

@@ -280,7 +280,7 @@ def test_an_input_that_says_stop_ends_the_run(tmp_path: Path) -> None:
 def runner_of(instance: Instance, last_point: int = 60) -> tuple[Runner, MemberTable]:
     """A runner in the middle of a run, whose steps are a tenth of a second, and where it is."""
     outputs = Layout.of([("y", "Float64")])
-    plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), {}, FmuConfig(fmu="Gain.fmu"))
+    plan = InstancePlan("gain", "Gain.fmu", {}, 1, outputs, Layout(), (), (), {}, FmuConfig(fmu="Gain.fmu"))
     map_, places = map_memory(["gain", MASTER], {"gain": ("gain", 1, outputs, 64)})
     memory = HostMemory.private(map_, "gain")
     ring, counter = memory.ring(places["gain"]), memory.counter(places["gain"].counter)
