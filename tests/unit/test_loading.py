@@ -118,7 +118,7 @@ STRUCTURE = [
     pytest.param(
         changed("step_size", "step_sise"),
         "mesh.yaml:2: simulation.step_sise: an unknown key; expected one of start_time, stop_time, "
-        "step_size, algorithm, window, real_time_factor, update_period, catch_up and 1 more. Did you mean 'step_size'?",
+        "step_size, algorithm, window, real_time_factor, update_period, catch_up and 4 more. Did you mean 'step_size'?",
         id="an unknown key suggests the nearest and hides that this one is missing",
     ),
     pytest.param(
@@ -196,7 +196,7 @@ STRUCTURE = [
     pytest.param(
         changed("{fmu: delay.fmu}", "delay.fmu"),
         "mesh.yaml:5: instances.delay: 'delay.fmu'; expected a mapping with fmu, kind, solver, tolerance, "
-        "retry_discarded_steps, start_values, inputs, step_size and 9 more",
+        "retry_discarded_steps, start_values, inputs, step_size and 11 more",
         id="text for a mapping",
     ),
     pytest.param(
