@@ -168,9 +168,9 @@ class Result(Mapping[str, NDArray[Any]]):
             >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
             >>> result = mesh.run(stop_time=1.0, record="memory", defects=True)
             >>> {name: round(defect.maximum, 4) for name, defect in result.defects.items()}
-            {'pendulum.a -> delay.x': 0.0055}
+            {'pendulum.a -> delay.x': 0.0074}
         """
-        if self.outcome is not None:
+        if self.outcome is not None and self.outcome.state == "done":
             return dict(self.outcome.defects)
         return convert(self.metadata.get("defects", {}), dict[str, Defect])
 

@@ -11,10 +11,22 @@ import pytest
 from numpy.typing import NDArray
 
 import fmu_mesh
-from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.errors import ConfigurationError, StepFailed
 from tests.helpers import FMUS, Place
 
 POINTS = 9000
+FAILING = """
+import fmu_mesh
+
+class Failing(fmu_mesh.Component):
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output()
+
+    def step(self, time, step_size):
+        if time > 0.5:
+            raise ValueError("no further")
+        self.y = self.u
+"""
 SOLVED: Mapping[str, Any] = {"loops": "solved", "extrapolation": "midpoint"}
 
 
@@ -92,6 +104,34 @@ def test_lines_have_smaller_defects_than_holding() -> None:
     )
 
     assert lines["v.y -> x.u"].rms < 0.02 * held["v.y -> x.u"].rms
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_a_run_that_fails_has_the_defects_of_its_rows(tmp_path: Path, processes: bool) -> None:  # noqa: FBT001  a parameter of the test
+    (tmp_path / "failing.py").write_text(FAILING)
+    mesh = fmu_mesh.Mesh("failing", step_size=0.001, stop_time=1.0)
+    mesh.add("x", fmu=str(FMUS / "Integrator.fmu"), start_values={"u": 1.0})
+    mesh.add("end", python=f"{tmp_path}/failing.py:Failing")
+    mesh.connect("x.y", "end.u")
+
+    with pytest.raises(StepFailed) as failed:
+        mesh.run(defects=True, output=tmp_path / "failing.csv", processes=processes)
+
+    result = failed.value.result
+    assert isinstance(result, fmu_mesh.Result)
+    assert result.defects["x.y -> end.u"].steps == len(result.times) - 1 == 501
+
+
+def test_a_run_from_a_state_compares_from_there_on(tmp_path: Path) -> None:
+    mesh = oscillator(algorithm="jacobi")
+    with mesh.open() as system:
+        system.step(300)
+        system.save(tmp_path / "here.state")
+
+    result = mesh.run(defects=True, state=tmp_path / "here.state", record="memory", stop_time=6.0, processes=False)
+
+    assert result.defects["v.y -> x.u"].steps == 300
+    assert result.defects["v.y -> x.u"].maximum == differences(result["v.y"])[0]
 
 
 def test_without_the_option_nothing_is_compared(tmp_path: Path) -> None:
