@@ -10,6 +10,7 @@ from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from msgspec import convert
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -23,6 +24,7 @@ from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOpti
 from ..pictures.tables import html_table
 from ..results.column_names import chosen_names, of_one_instance
 from ..results.csv_file import CsvFile
+from ..results.defects import Defect
 from ..results.formats import read_result, result_pieces
 from ..results.parquet_file import ParquetFile
 from ..results.recording import Columns, ResultFile, joined
@@ -155,6 +157,22 @@ class Result(Mapping[str, NDArray[Any]]):
             ()
         """
         return self.outcome.warnings if self.outcome is not None else ()
+
+    @property
+    def defects(self) -> dict[str, Defect]:
+        """By connection, how far what came was from what was assumed: it points to a connection, and is no error.
+
+        Empty for a run without `defects=True`.
+
+        Example:
+            >>> mesh = fmu_mesh.load("configs/pendulum_delay.yaml")
+            >>> result = mesh.run(stop_time=1.0, record="memory", defects=True)
+            >>> {name: round(defect.maximum, 4) for name, defect in result.defects.items()}
+            {'pendulum.a -> delay.x': 0.0074}
+        """
+        if self.outcome is not None and self.outcome.state == "done":
+            return dict(self.outcome.defects)
+        return convert(self.metadata.get("defects", {}), dict[str, Defect])
 
     @property
     def summary(self) -> str:

@@ -124,7 +124,9 @@ def _add_nodes(parser: argparse._ActionsContainer) -> None:
 PARSERS: Parsers = {
     "launch": (
         *CONFIGURED,
-        options("state", "replaced", "paused", "view", "video", "profile", "processes", "restarts", "resume"),
+        options(
+            "state", "replaced", "paused", "view", "video", "profile", "defects", "processes", "restarts", "resume"
+        ),
         _PLOT,
         *_OUTPUT,
         _EVENTS,

@@ -88,3 +88,10 @@ class SimulationConfig(Base, frozen=True, kw_only=True):
         Extrapolation,
         Meta(description=f"For connections and instances without an own `extrapolation`. {EXTRAPOLATIONS}"),
     ] = "hold"
+    defects: Annotated[
+        bool,
+        Meta(
+            description="true: what each input was assumed to be over a step is compared with what came; the largest "
+            "differences are in the summary, and all are in the metadata of the result."
+        ),
+    ] = False

@@ -55,6 +55,7 @@ from ..errors import (
     RunReset,
 )
 from ..files import Kept
+from ..results.defects import Defect, DefectWatch
 from ..results.growth import GrowthWatch
 from ..results.played_rows import MemoryOf, PlayedRows
 from ..results.record_files import RecordFiles
@@ -146,6 +147,7 @@ class Recorder:
         wanted: Callable[[], int] = lambda: ENDLESS,
         *,
         growth: GrowthWatch | None = None,
+        defects: DefectWatch | None = None,
         notes: Path | None = None,
         launch: str | None = None,
         router: RouterLink | None = None,
@@ -165,7 +167,7 @@ class Recorder:
         self._rows = min(place.rows for place in plan.rings)
         # At the end of the window, the nodes would wait for this thread.
         self._wake_rows = max(1, min(_WAKE_ROWS, plan.window // 2))
-        self._files = RecordFiles(files, growth, notes)
+        self._files = RecordFiles(files, growth, notes, defects)
         self._wanted, self._on_flush, self._played = wanted, on_flush, played
         self._first = self._written = self._told = plan.grid.first_point
         self._flushed = 0.0
@@ -189,6 +191,11 @@ class Recorder:
     def warnings(self) -> tuple[str, ...]:
         """What the rows warn of; complete after the `with` block."""
         return self._files.warnings
+
+    @property
+    def defects(self) -> dict[str, Defect]:
+        """See `RecordFiles`; complete after the `with` block."""
+        return self._files.defects
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -31,6 +31,7 @@ from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
+from .defects import Defect, DefectWatch
 from .formats import goes_on, reading, required_format
 from .growth import GrowthWatch, ReadColumn
 from .keys_file import KeysFile, keys_beside
@@ -103,7 +104,7 @@ class RecordFiles:
 
     Args:
         files: the files, in the order of their plans.
-        growth: looks at all rows.
+        growth: looks at all rows; ``defects`` as well.
         notes: the folder of the run, if somebody calls `rows_left` when this process was killed.
 
     Attributes:
@@ -111,9 +112,13 @@ class RecordFiles:
     """
 
     def __init__(
-        self, files: Sequence[ResultFile], growth: GrowthWatch | None = None, notes: Path | None = None
+        self,
+        files: Sequence[ResultFile],
+        growth: GrowthWatch | None = None,
+        notes: Path | None = None,
+        defects: DefectWatch | None = None,
     ) -> None:
-        self._growth = growth
+        self._growth, self._defects = growth, defects
         self._writing: tuple[Path] | None = None  # the file of the call under way, another tuple for each
         self._watched: tuple[tuple[Path] | None, float] = None, 0.0
         self._files = [
@@ -136,6 +141,11 @@ class RecordFiles:
         return (*told, *(self._growth.warnings if self._growth is not None else ()))
 
     @property
+    def defects(self) -> dict[str, Defect]:
+        """Of each compared connection, how far what came in the rows so far was from what was assumed."""
+        return self._defects.defects if self._defects is not None else {}
+
+    @property
     def counted(self) -> tuple[tuple[str, int], ...]:
         """The path and the number of rows of each file; after `close`, of those in the file."""
         return tuple((str(own.file.path), own.file.rows) for own in self._files)
@@ -152,10 +162,12 @@ class RecordFiles:
             for key in record.variables:
                 if key not in columns:
                     own_sum = record.consistent.get(".".join(key))
-                    columns[key] = column_of(*key) if own_sum is None else _sum(own_sum, column_of)
+                    columns[key] = column_of(*key) if own_sum is None else _sum(column_of, own_sum)
             own.begin(grid, record, [columns[key] for key in record.variables])
         if self._growth is not None:
             self._growth.begin(columns)
+        if self._defects is not None:
+            self._defects.begin(partial(_sum, column_of))
 
     def begin_again(self, files: Sequence[ResultFile]) -> None:
         """Another run begins, with as many files for the same columns."""
@@ -164,6 +176,8 @@ class RecordFiles:
         self._begin_files()
         if self._growth is not None:
             self._growth.begin_again()
+        if self._defects is not None:
+            self._defects.begin_again()
 
     def write(self, first: int, end: int) -> None:
         """Write the rows of the points first to end - 1, as far as they are not written yet.
@@ -173,6 +187,8 @@ class RecordFiles:
         """
         if self._growth is not None:
             self._growth.look(first, end)
+        if self._defects is not None:
+            self._defects.look(first, end)
         if self._keys is not None:
             self._keep(self._keys.begin)
         self._each(lambda own: own.write(first, end))
@@ -212,7 +228,11 @@ class RecordFiles:
         """Close all files. Nothing happens if they are closed. The errors are those of `write`."""
         if self._keys is not None:
             self._keys.close()
-        self._raise_first([(own, self.write_to(own.file.path, own.close)) for own in self._files])
+        try:
+            if defects := to_builtins(self.defects):
+                self.note({"defects": defects})
+        finally:
+            self._raise_first([(own, self.write_to(own.file.path, own.close)) for own in self._files])
 
     def check_writing(self, now: float, limit_s: float) -> None:
         """From another thread, at least twice a second: look whether each call returns in time; ``now`` is in s.
@@ -247,10 +267,12 @@ class RecordFiles:
                 raise unwritable(own.file.path, error) from error
 
 
-def _sum(consistent: Consistent, column_of: Callable[[str, str], ReadColumn]) -> ReadColumn:
+def _sum(column_of: Callable[[str, str], ReadColumn], consistent: Consistent) -> ReadColumn:
     """A function that calculates a consistent output from the columns that it depends on."""
     terms = [(column_of(term.instance, term.column), term.factor) for term in consistent.terms]
     (read_first, factor), *others = terms
+    if not others and (factor, consistent.constant) == (1.0, 0.0):
+        return read_first
 
     def read(first: int, end: int) -> NDArray[Any]:
         with np.errstate(all="ignore"):  # the row that is not finite ends the run

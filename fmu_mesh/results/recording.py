@@ -20,6 +20,7 @@ from ..config.loading import LoadedConfig
 from ..files import Kept, decoded_json
 from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_types import VariableType
+from .defects import Defect
 
 __all__ = [
     "Columns",
@@ -309,6 +310,7 @@ class _Metadata(msgspec.Struct):
     versions: dict[str, str] = {}
     variables: dict[str, _Described] = {}
     set: list[dict[str, Any]] = []
+    defects: dict[str, Defect] = {}
 
 
 class _Described(msgspec.Struct):

@@ -145,6 +145,9 @@ class PlanOptions(BeginOptions, frozen=True, kw_only=True):
     real_time_factor: Annotated[Number, Option(None, "--real-time-factor", "F", "simulation.real_time_factor")] = None
     update_period: Annotated[Number, Option(None, "--update-period", "S", "simulation.update_period")] = None
     catch_up: Annotated[Number, Option(None, "--catch-up", "S", "simulation.catch_up")] = None
+    defects: Annotated[
+        bool, Option("show where inputs differ most from what was assumed", "--defects", key="simulation.defects")
+    ] = False
     record: Annotated[
         Literal["memory"] | Sequence[str] | None,
         Option(

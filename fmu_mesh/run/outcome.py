@@ -8,6 +8,7 @@ from typing import Literal
 import msgspec
 
 from ..errors import ErrorReport, FmuMeshError
+from ..results.defects import Defect
 from ..system.plan import Plan
 from ..wire.time_profile import MeshProfile
 
@@ -31,6 +32,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
         files: each result file, and the number of its rows.
         warnings: what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended.
         first: the point at which the run began.
+        defects: what came in each connection, compared with what was assumed, if that was asked for.
     """
 
     state: Literal["done", "failed"]
@@ -46,6 +48,7 @@ class Outcome(msgspec.Struct, frozen=True, tag="end"):
     files: tuple[tuple[str, int], ...] = ()
     warnings: tuple[str, ...] = ()
     first: int = 0
+    defects: dict[str, Defect] = {}
 
 
 def last_recorded(plan: Plan, files: Sequence[tuple[str, int]]) -> int:

@@ -34,7 +34,6 @@ from ..instances.process_state import kept_state
 from ..instances.registry import open_instance
 from ..master.pacing import Pacer
 from ..node.engine import Engine
-from ..results.growth import GrowthWatch
 from ..results.recording import ResultFile
 from ..system.plan import Plan
 from ..variables.value_types import PlainValue
@@ -137,7 +136,7 @@ class RepeatedRuns:
             made_for = run, len(files := open_files()), watch
             system = self._system if all(map(is_, made_for, self._made_for)) else None
             if system is None or system.loads or (writer := self._writer) is None:
-                system, self._writer = None, (writer := RowWriter(files, GrowthWatch(run.plan)))
+                system, self._writer = None, (writer := RowWriter(files, run.plan))
             else:
                 writer.begin_again(files)
             with closing(writer):
@@ -358,7 +357,8 @@ class _Run:
         if self._end is not None:
             return self._end
         own = self._plan, self.point, self.writer.counted, None, self._asked
-        self._end = outcome_at(*own, seconds=self._seconds, warnings=self.writer.warnings)
+        ended = outcome_at(*own, seconds=self._seconds, warnings=self.writer.warnings)
+        self._end = replace(ended, defects=self.writer.defects)
         return self._end
 
     def _leave(self, *, failed: bool) -> None:

@@ -27,6 +27,7 @@ from ..master.master import Master
 from ..master.mesh_server import MasterSettings
 from ..node.node import Node
 from ..recorder.recorder import Recorder
+from ..results.defects import DefectWatch
 from ..results.growth import GrowthWatch
 from ..results.record_files import open_results
 from ..results.recording import ResultFile
@@ -403,6 +404,7 @@ class _MasterRuns:
             files,
             lambda: master.wanted,
             growth=GrowthWatch(plan),
+            defects=DefectWatch(plan),
             notes=process.folder if process.is_child else None,
             launch=process.launch,
             router=RouterLink(self.session, self.run.loaded.config.zenoh.connect),
@@ -430,7 +432,8 @@ def _outcome_of(
         point, error, ended_by = max(point, last_recorded(run.plan, files)), None, error
     told = (*warnings, *master.warnings)
     outcome = outcome_at(run.plan, point, files, error, ended_by, seconds=master.seconds, warnings=told)
-    return replace(outcome, profile=master.profile(), signal=signal)
+    defects = recorder.defects if recorder is not None else {}
+    return replace(outcome, profile=master.profile(), signal=signal, defects=defects)
 
 
 class _Emitter:

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 
 from ..node.stepping import Runner
 from ..recorder.recorded_source import RecordedSource
+from ..results.defects import Defect, DefectWatch
 from ..results.growth import GrowthWatch
 from ..results.record_files import RecordFiles, what_is_kept
 from ..results.recording import ResultFile
@@ -36,15 +37,15 @@ class RowWriter:
 
     Args:
         files: the files; empty: nothing is recorded.
-        growth: looks at all rows.
+        plan: the plan of the run: what its rows warn of, and the defects of its connections.
 
     Attributes:
         written: number of points whose rows are written.
     """
 
-    def __init__(self, files: Sequence[ResultFile], growth: GrowthWatch | None = None) -> None:
+    def __init__(self, files: Sequence[ResultFile], plan: Plan) -> None:
         self.written = 0
-        self._files = RecordFiles(files, growth)
+        self._files = RecordFiles(files, GrowthWatch(plan), defects=DefectWatch(plan))
         self._sources: list[RecordedSource] = []
         self._rows = 1
         self._flushed = 0.0
@@ -81,6 +82,11 @@ class RowWriter:
     def warnings(self) -> tuple[str, ...]:
         """What the rows so far warn of."""
         return self._files.warnings
+
+    @property
+    def defects(self) -> dict[str, Defect]:
+        """See `RecordFiles`."""
+        return self._files.defects
 
     @property
     def complete(self) -> int:

@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Consistent", "CouplingRule", "SourceLine", "Term"]
+__all__ = ["Consistent", "CouplingRule", "Lines", "SourceLine", "Term", "lines_through"]
 
 _JUMP: Final = 4.0
 _PART: Final = 0.1
@@ -96,6 +96,27 @@ class SourceLine(msgspec.Struct, frozen=True):
         return self.value if self.jumped else self.at(begin + 0.5 * points)
 
 
+class Lines(NamedTuple):
+    """Many lines, each with its last value; arrays, as the fields of `SourceLine`."""
+
+    change: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    jumped: NDArray[np.bool_]
+
+
+def lines_through(values: NDArray[np.float64], points: NDArray[np.float64]) -> Lines:
+    """What `SourceLine.through` gives, one after another, for values at ascending points."""
+    change, distance, jumped = np.zeros_like(values), np.ones_like(points), np.zeros(len(values), bool)
+    np.subtract(values[1:], values[:-1], out=change[1:])
+    np.subtract(points[1:], points[:-1], out=distance[1:])
+    sizes = np.abs(values)
+    large = np.flatnonzero(np.abs(change[1:]) > _PART * np.maximum(sizes[1:], sizes[:-1])) + 1  # few are
+    before = change[large - 1] / distance[large - 1]
+    is_sudden = np.abs(change[large] / distance[large] - before) > _JUMP * np.abs(before)
+    jumped[large] = is_sudden & (points[large - 1] > 0)
+    return Lines(change, distance, jumped)
+
+
 class Term(NamedTuple):
     """A column of the row of an instance, and what it is multiplied by."""
 
@@ -112,3 +133,8 @@ class Consistent(NamedTuple):
 
     constant: float
     terms: tuple[Term, ...]
+
+    def scaled(self, factor: float, offset: float) -> Consistent:
+        """What an input gets by a connection with this factor and this offset."""
+        terms = tuple(term._replace(factor=factor * term.factor) for term in self.terms)
+        return Consistent(factor * self.constant + offset, terms)

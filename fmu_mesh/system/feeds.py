@@ -8,11 +8,22 @@ from typing import NamedTuple
 
 import msgspec
 
+from ..config.instance_sections import Extrapolation
+from ..variables.value_types import is_float
 from .connections import Connection
 from .consistent_outputs import element_pairs
-from .coupling_rule import Consistent
+from .coupling_rule import Consistent, CouplingRule, Term
 
-__all__ = ["Feed", "FeedColumn", "consistent_columns", "feeds_of", "reads_of", "step_feeds_of"]
+__all__ = [
+    "Compared",
+    "Feed",
+    "FeedColumn",
+    "compared_of",
+    "consistent_columns",
+    "feeds_of",
+    "reads_of",
+    "step_feeds_of",
+]
 
 
 class FeedColumn(NamedTuple):
@@ -31,6 +42,20 @@ class FeedColumn(NamedTuple):
     map: tuple[tuple[int, int], ...] = ()
     items: tuple[tuple[str, int], ...] = ()
     adds: bool = False
+
+
+class Compared(NamedTuple):
+    """A connection, or that of one element, whose assumed values are compared with those that come (`--defects`).
+
+    Attributes:
+        name: `a.y -> b.u`.
+        value: the input at a point, from the rows of that point.
+    """
+
+    name: str
+    rule: CouplingRule
+    way: Extrapolation
+    value: Consistent
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -79,9 +104,28 @@ def consistent_columns(
         if own is None:
             yield c.source_instance, delay, FeedColumn(source, target, c.factor, c.offset)
             continue
-        for number, term in enumerate(own.terms):
-            offset = c.factor * own.constant + c.offset if not number else 0.0
-            yield term.instance, delay, FeedColumn(term.column, target, c.factor * term.factor, offset, adds=number > 0)
+        scaled = own.scaled(c.factor, c.offset)
+        for number, term in enumerate(scaled.terms):
+            offset = scaled.constant if not number else 0.0
+            yield term.instance, delay, FeedColumn(term.column, target, term.factor, offset, adds=number > 0)
+
+
+def compared_of(
+    connections: Iterable[Connection],
+    consistent: Mapping[tuple[str, str], Consistent],
+    step_points: Mapping[str, int],
+) -> Iterator[Compared]:
+    """What targets assume over their steps, as far as it can be compared: continuous inputs with continuous sources."""
+    for c in connections:
+        ends = c.source, c.target
+        if c.initial_only or any(not is_float(end.type) or end.variability != "continuous" for end in ends):
+            continue
+        rule = CouplingRule(c.delay or 0, step_points[c.source_instance], step_points[c.target_instance])
+        for source, target in element_pairs(c):
+            key = c.source_instance, source
+            value = consistent.get(key) or Consistent(0.0, (Term(*key, 1.0),))
+            name = f"{c.source_instance}.{source} -> {c.target_instance}.{target}"
+            yield Compared(name, rule, c.extrapolation or "hold", value.scaled(c.factor, c.offset))
 
 
 def _column(c: Connection) -> FeedColumn:

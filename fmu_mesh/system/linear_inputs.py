@@ -5,7 +5,7 @@ What they get is `fmu_mesh.system.coupling_rule`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 from msgspec.structs import replace
@@ -38,14 +38,12 @@ class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def with_extrapolation(
     config: Config,
     connections: Sequence[Connection],
-    retrying: Collection[str],
     descriptions: Mapping[str, ModelDescription],
     findings: Findings,
 ) -> tuple[Connection, ...]:
     """The connections with their ways of extrapolation; a finding for every way that a target does not support.
 
-    What is said for an instance or for all holds for the inputs that can change within a step. Discarded steps of the
-    ``retrying`` instances are retried.
+    What is said for an instance or for all holds for the inputs that can change within a step.
     """
     found = []
     for c in connections:
@@ -55,7 +53,7 @@ def with_extrapolation(
             general, place = config.simulation.extrapolation, "simulation.extrapolation"
         wanted: Extrapolation = own or general
         description = descriptions[c.target_instance]
-        why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=c.target_instance in retrying)
+        why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=target.retries_steps)
         way: Extrapolation = wanted
         if wanted == "auto":
             way = _auto(why_held, why_not_linear)

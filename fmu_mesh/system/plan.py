@@ -26,7 +26,7 @@ from .consistent_outputs import consistent_outputs
 from .coupling_rule import Consistent
 from .digest import digest_of
 from .execution_order import execution_order
-from .feeds import Feed, feeds_of, reads_of, step_feeds_of
+from .feeds import Feed, compared_of, feeds_of, reads_of, step_feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .input_timeouts import InputTimeout
 from .layout import Layout, row_bytes
@@ -35,7 +35,7 @@ from .live_keys import KeyInput, KeyOutput, RecordedKeys
 from .memory_map import MASTER, RECORDER, MemoryMap, RingPlace, map_memory
 from .node_links import Link, links_of
 from .played_nodes import keeps_states, played_nodes
-from .records import RecordPlan, union_of
+from .records import RecordPlan
 from .schedule import Schedule, row_of
 from .start_values import why_not_settable
 from .system import Connection, ResolvedSystem, SystemInstance
@@ -168,11 +168,6 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The Python that has to run this node; None: the one that runs fmu-mesh."""
         return next((own for item in self.instances if (own := item.section.interpreter) is not None), None)
 
-    @property
-    def recorded(self) -> tuple[tuple[str, str], ...]:
-        """(instance, variable) of what all result files need, each once, if it is the recorder."""
-        return union_of(self.records)
-
     def peers(self) -> set[str]:
         """Names of the nodes that exchange frames with this one, without the recorder, which is part of the master."""
         nodes = {link.source_node for link in self.links_in} | {link.target_node for link in self.links_out}
@@ -255,7 +250,12 @@ def make_plan(
     consistent = consistent_outputs(system.connections, system.feedthrough, points, findings)
     solved = consistent if system.config.simulation.loops == "solved" else None
     connections, closing, order, cycles = execution_order(names, system.connections, how, findings, solved)
-    system = replace(system, records=tuple(record.with_consistent(consistent) for record in system.records))
+    compares = system.config.simulation.defects and system.records  # it is done where rows are written
+    system = replace(
+        system,
+        records=tuple(record.with_consistent(consistent) for record in system.records),
+        compared=tuple(compared_of(connections, consistent, points)) if compares else (),
+    )
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, {n: own.description for n, own in system.instances.items()}, findings)
     reads = reads_of(connections, consistent)

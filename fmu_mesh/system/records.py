@@ -24,6 +24,7 @@ from ..variables.model_description import Causality, ModelDescription, Variable
 from ..variables.value_types import element_name, is_text, split_element
 from .connections import Variables, resolve_variable
 from .coupling_rule import Consistent
+from .feeds import Compared
 
 __all__ = [
     "IN_MEMORY",
@@ -104,11 +105,12 @@ class RecordPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return slice(self.point_of(self.rows_before(first)) - first, end - first, self.every)
 
 
-def union_of(records: Sequence[RecordPlan]) -> tuple[tuple[str, str], ...]:
-    """(instance, variable) of what all files need, each once, in the order of the files."""
-    if len(records) == 1 and not records[0].consistent:
+def union_of(records: Sequence[RecordPlan], compared: Sequence[Compared] = ()) -> tuple[tuple[str, str], ...]:
+    """(instance, variable) of what all files need, and what is compared, each once, in the order of the files."""
+    if len(records) == 1 and not records[0].consistent and not compared:
         return records[0].variables
-    return tuple(dict.fromkeys(column for record in records for column in record.read))
+    columns = [column for record in records for column in record.read]
+    return tuple(dict.fromkeys([*columns, *(term[:2] for one in compared for term in one.value.terms)]))
 
 
 CheckRecord = Callable[[RecordPlan, str, Mapping[str, ModelDescription], Findings], None]
@@ -151,6 +153,9 @@ def resolve_records(  # noqa: PLR0913, PLR0917  sections, what they may refer to
             findings.add(f"{place}.file", found, f"variables in `{place}.variables`, or null to record nothing")
         if chosen:
             records.append(RecordPlan(file, chosen, first, section.every))
+    if loaded.config.simulation.defects and not records and not len(findings):
+        found = "true, but defects are calculated where rows are written, and nothing is recorded"
+        findings.add("simulation.defects", found, "a file in `record`, or false")
     return tuple(records)
 
 

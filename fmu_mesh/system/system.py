@@ -29,6 +29,7 @@ from fmu_mesh.simtime import ENDLESS, TimeGrid, steps_between
 from fmu_mesh.system.connections import Connection, Variables, resolve_connections, unit_warnings
 from fmu_mesh.system.couplings import coupled_connections
 from fmu_mesh.system.execution_order import execution_order
+from fmu_mesh.system.feeds import Compared
 from fmu_mesh.system.input_timeouts import InputTimeout
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import with_extrapolation
@@ -86,6 +87,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
         recorded_keys: an earlier run, whose values of keys this run gets instead of those of the keys.
         begins_with: the state file with which it begins, absolute, or nothing; the ``replaced`` begin anew there.
         feedthrough: the derivatives of outputs by inputs at the same point, if outputs are made consistent.
+        compared: what targets assume over their steps, if that is compared with what comes.
     """
 
     config: Config
@@ -100,6 +102,7 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
     begins_with: str = ""
     feedthrough: dict[str, dict[str, dict[str, float]]] = {}
     replaced: tuple[str, ...] = ()
+    compared: tuple[Compared, ...] = ()
 
     @property
     def keys(self) -> tuple[KeyView, ...]:
@@ -109,8 +112,8 @@ class ResolvedSystem(msgspec.Struct, frozen=True):
 
     @property
     def recorded(self) -> tuple[tuple[str, str], ...]:
-        """(instance, variable) of what all result files need, each once; an element of an array is `y[1,2]`."""
-        return union_of(self.records)
+        """(instance, variable) of what is read where rows are written, each once; an element is `y[1,2]`."""
+        return union_of(self.records, self.compared)
 
     def base_of(self, instance: str, name: str) -> str:
         """The variable of a column or of an end of a connection, which may be an element of an array, as `y[1,2]`."""
@@ -176,9 +179,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     forbidden_start_values(config, descriptions, collected, strict=True)
     _check_nodes(config, descriptions, claims, collected)
     connections = resolve_connections(config.connections, variables, collected)
-    retrying = {name for name, section in config.instances.items() if section.retries_steps}
     connections += coupled_connections(config.engines, variables, connections, collected)
-    connections = with_extrapolation(config, connections, retrying, descriptions, collected)
+    connections = with_extrapolation(config, connections, descriptions, collected)
     if obstacles is not None:
         obstacles.explain(collected.places)
     of_files = collected if obstacles is None else obstacles

@@ -41,6 +41,7 @@ RIGHT: Mapping[str, Any] = {
     "connect": ["tcp/127.0.0.1:7447"],
     "security": "lab/host",
     "insecure": True,
+    "defects": True,
     "paused": False,
     "view": False,
     "video": None,

@@ -74,7 +74,7 @@ class EngineMesh:
                     instance = open_instance(place.instance)
                     self.runners[place.instance] = Runner(node.instance(place.instance), instance, plan.grid, *ring)
         self._written = 0
-        self._recorded = list(dict.fromkeys(name for name, _ in plan.nodes[RECORDER].recorded)) if self._records else []
+        self._recorded = list(dict.fromkeys(name for name, _ in plan.system.recorded)) if self._records else []
         self.recorded = {name: [] for name in self._recorded}
         self.engines = {name: self._engine(node, make) for name, node in plan.nodes.items() if name != RECORDER}
 

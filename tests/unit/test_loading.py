@@ -118,7 +118,7 @@ STRUCTURE = [
     pytest.param(
         changed("step_size", "step_sise"),
         "mesh.yaml:2: simulation.step_sise: an unknown key; expected one of start_time, stop_time, "
-        "step_size, algorithm, window, real_time_factor, update_period, catch_up and 3 more. Did you mean 'step_size'?",
+        "step_size, algorithm, window, real_time_factor, update_period, catch_up and 4 more. Did you mean 'step_size'?",
         id="an unknown key suggests the nearest and hides that this one is missing",
     ),
     pytest.param(

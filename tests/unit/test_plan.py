@@ -83,7 +83,7 @@ def test_instances_of_one_node_have_no_link() -> None:
 
 def test_there_is_no_recorder_without_a_result_file() -> None:
     assert RECORDER not in Scenario(("a -> b",)).plan().nodes
-    assert Scenario(("a -> b",)).plan(record=True).nodes[RECORDER].recorded == (("a", "point"), ("b", "point"))
+    assert Scenario(("a -> b",)).plan(record=True).system.recorded == (("a", "point"), ("b", "point"))
 
 
 def test_connections_with_other_delays_are_other_feeds() -> None:

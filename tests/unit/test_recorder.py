@@ -20,6 +20,7 @@ from fmu_mesh.results.csv_file import CsvFile
 from fmu_mesh.rings.host_memory import HostMemory
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.system.plan import MASTER, RECORDER, NodePlan
+from fmu_mesh.system.records import union_of
 from fmu_mesh.wire.frames import encode_rows
 from fmu_mesh.wire.keys import Keys, RunKeys
 from fmu_mesh.wire.membership import Admission, Hello, Welcome
@@ -62,7 +63,7 @@ class Mesh:
 
     def file(self) -> CsvFile:
         """The result file."""
-        return CsvFile(self._folder / "result.csv", [(f"{i}.{v}", "Float64") for i, v in self.plan.recorded])
+        return CsvFile(self._folder / "result.csv", [(f"{i}.{v}", "Float64") for i, v in union_of(self.plan.records)])
 
     def put(self, message: bytes) -> None:
         """What the master sends."""

@@ -13,6 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from ...errors import ErrorReport, FmuMeshError
+from ...results.defects import Defect
 from ...run.events import Event, Restarted, WasReset
 from ...run.outcome import Outcome
 from ...run.overriding import memory_of
@@ -23,7 +24,7 @@ from .terminal import stdout_as_stderr
 __all__ = ["RunReport", "RunReporter"]
 
 
-_AS_THE_OUTCOME = ("point", "time", "seconds", "rows", "file", "ended_by", "warnings")
+_AS_THE_OUTCOME = ("point", "time", "seconds", "rows", "file", "ended_by", "warnings", "defects")
 
 
 class ReportedFile(msgspec.Struct, frozen=True):
@@ -51,6 +52,7 @@ class RunReport(msgspec.Struct, frozen=True):
     files: tuple[ReportedFile, ...] = ()  # all result files, each with its number of rows
     # what is wrong although nothing failed: a value that grows without a limit, or how an FMU has ended
     warnings: tuple[str, ...] = ()
+    defects: dict[str, Defect] = {}  # with `--defects`, by connection: what came, compared with what was assumed
 
 
 class RunReporter:
