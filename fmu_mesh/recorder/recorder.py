@@ -107,11 +107,9 @@ _REST_S = 0.005
 and writing many rows at once takes less time."""
 
 _LAST_S = 0.5
+"""How long in s the recorder waits for the last rows of the nodes when a run ends early."""
 _MOST_KEYS = 8 * MAX_TEXT_SIZE
 """In bytes; JSON has up to six for a character."""
-
-"""How long in s the recorder waits for the last rows of the nodes when a run ends early."""
-
 _FLUSH_S = 0.2
 _LOOK_S = 0.1
 """How often in s the end of the recorder is looked at for a write that does not return."""

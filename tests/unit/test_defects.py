@@ -53,7 +53,7 @@ def looked(watch: DefectWatch, points: int, block: int, first: int = 0) -> dict[
 
 
 def step_by_step(rule: CouplingRule, way: Extrapolation, values: NDArray[np.float64]) -> Iterator[tuple[int, float]]:
-    """The point and the difference of each step of the target in which a value came, with one `SourceLine` after another."""
+    """The point and the difference of each step of the target in which a value came, with one line after another."""
     own, knows_end = rule.source_points, not rule.delay and rule.target_points >= rule.source_points
     line = SourceLine(float(values[0]))
     for begin in range(0, len(values) - rule.target_points, rule.target_points):
