@@ -316,7 +316,7 @@ class PlainEngine(Engine):
             for source in runner.sources:
                 source.transfer.step(step)
             member.stage = Stage.IN_PYTHON
-            runner.instance.do_step(step)
+            runner.do_step(step)
             if not runner.is_finite.check(step + 1):
                 runner.not_finite(step)
         except FmuMeshError as error:

@@ -6,7 +6,7 @@ that frames fill. It owns nothing about waiting. `fmu_mesh.node.engine` steps th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple, Protocol, cast
 
@@ -94,6 +94,7 @@ class Runner:
         self.counter = counter
         self.sources: list[Source] = []
         self.out_links: list[OutLink] = []
+        self._together: tuple[Runner, ...] = ()
         self.watched: Ring | None = None
         self.last_step = grid.last_point // plan.step_points
         self.grid = grid
@@ -127,8 +128,31 @@ class Runner:
             gate.note(known=0)
 
     def _fill_unconnected(self) -> None:
-        connected = [own.target for source in self.sources for own in source.transfer.columns]
+        connected = [own.target for feed in self.plan.step_feeds for own in feed.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
+
+    def solve_with(self, others: Sequence[Runner]) -> None:
+        """Take the steps of a solved group, of which it is the first member: it needs what all of them read."""
+        self._together = (*others, self)
+        for other in others:
+            self.sources.extend(other.sources)
+            other.sources.clear()
+            other.follow_first()
+
+    def follow_first(self) -> None:
+        """The first member of its solved group takes its steps."""
+        self._together = (self,)
+
+    @property
+    def do_step(self) -> Callable[[int], None]:
+        """How its step is taken, when all sources have moved their values."""
+        if not self._together:
+            return self.instance.do_step
+        return self._step_together if len(self._together) > 1 else _is_done
+
+    def _step_together(self, step: int) -> None:
+        for runner in self._together:
+            runner.instance.do_step(step)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode, or of the state with which the run begins, are complete.
@@ -298,6 +322,9 @@ def connect(
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
         runner.sources.extend(sources_of(runner, rows, points))
+    for group in plan.groups:
+        first, *others = (runners[name] for name in group.members)
+        first.solve_with(others)
     return Connected(receivers, streamed)
 
 
@@ -318,6 +345,10 @@ def sources_of(
             )
             if transfer.columns:
                 yield Source(feed.source, transfer, counter)
+
+
+def _is_done(_step: int) -> None:
+    """The step of a member of a solved group that is not the first: that one has taken it."""
 
 
 def _fits(runners: Mapping[str, Runner], source: str, end: int) -> bool:

@@ -32,6 +32,7 @@ from ..system.point_loops import warn_of_point_loops
 from ..system.process_sharing import Claims
 from ..system.run_metadata import configuration_of
 from ..system.scenario import Scenario
+from ..system.solved_groups import blocks_of
 from ..system.system import ResolvedSystem, build
 from ..text import nearest_file
 from ..variables.model_description import ModelDescription, Variable
@@ -189,7 +190,7 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
-    if loaded.config.simulation.loops == "solved":
+    if loaded.config.simulation.loops == "solved" or blocks_of(loaded.config):
         system = with_feedthrough(system, sections, findings, warnings)
         findings.raise_any()
     _check_host(loaded.config, obstacles, warnings)

@@ -5,7 +5,7 @@ What they get is `fmu_mesh.system.coupling_rule`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 from msgspec.structs import replace
@@ -15,6 +15,7 @@ from ..config.instance_sections import Extrapolation
 from ..config.mesh import Config
 from ..variables.model_description import ModelDescription
 from .connections import Connection
+from .solved_groups import blocks_of, is_solved
 
 __all__ = ["LinearInput", "with_extrapolation"]
 
@@ -37,24 +38,27 @@ class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def with_extrapolation(
     config: Config,
     connections: Sequence[Connection],
-    retrying: Collection[str],
     descriptions: Mapping[str, ModelDescription],
     findings: Findings,
 ) -> tuple[Connection, ...]:
     """The connections with their ways of extrapolation; a finding for every way that a target does not support.
 
-    What is said for an instance or for all holds for the inputs that can change within a step. Discarded steps of the
-    ``retrying`` instances are retried.
+    Within a solved group it is `linear` where the target takes that: its line ends at the value that is solved.
+
+    What is said for an instance or for all holds for the inputs that can change within a step.
     """
-    found = []
+    found, blocks = [], blocks_of(config)
     for c in connections:
         own, target = c.extrapolation, config.instances[c.target_instance]
         general, place = target.extrapolation, f"instances.{c.target_instance}.extrapolation"
         if general is None:
             general, place = config.simulation.extrapolation, "simulation.extrapolation"
-        wanted: Extrapolation = own or general
+        solved = is_solved(c, blocks)
+        if solved and own is not None:
+            findings.add(f"{c.path}.extrapolation", f"{own} for {c}, within a group that is solved", "none")
+        wanted: Extrapolation = "auto" if solved else own or general
         description = descriptions[c.target_instance]
-        why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=c.target_instance in retrying)
+        why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=target.retries_steps)
         way: Extrapolation = wanted
         if wanted == "auto":
             way = "hold" if why_held else "midpoint" if why_not_linear else "linear"
