@@ -74,12 +74,14 @@ class _GroupState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         size: the length of that step in s.
         inverse: what the differences are multiplied by to correct the unknowns; None: the Jacobian is not measured.
         level: how many times step control halves the next step.
+        is_new: whether ``slopes`` are the first ones after a jump.
     """
 
     slopes: tuple[float, ...] | None = None
     size: float = 0.0
     inverse: tuple[tuple[float, ...], ...] | None = None
     level: int = 0
+    is_new: bool = False
 
 
 class _OwnState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -408,7 +410,7 @@ class _TightGroup:
         """Whether the lines are near enough to the courses of the unknowns, as far as their ends tell.
 
         The end of a step and the slope before it give the second derivative, and that the distance in the middle. What
-        jumps at a point, such as an input from outside, does so within the smallest step there.
+        jumps does so within one smallest step. The next one finds the new slope, and then the error has to be small.
         """
         tolerance, known = self._plan.step_tolerance, self.known
         slopes, size = known.slopes or (0.0,) * len(ends), known.size if known.slopes is not None else 0.0
@@ -416,19 +418,18 @@ class _TightGroup:
             _relative(end - (a + slope * span.size), end) for a, slope, end in zip(starts, slopes, ends, strict=True)
         ]
         error = max(bends) * span.size / (4.0 * (span.size + size))
-        jumps = False
-        if tolerance is not None and error > tolerance:
-            if level < self._most:
-                more = math.ceil(0.5 * math.log2(error / tolerance / _SAFETY))
-                self.known = replace(known, level=min(level + max(more, 1), self._most))
-                return False
-            jumps = span.first == 0.0
-            if not jumps:
-                raise self._too_coarse(bends, error)
-        elif tolerance is not None and error < _EASY * tolerance:
+        is_large = tolerance is not None and error > tolerance
+        if is_large and level < self._most:
+            more = math.ceil(0.5 * math.log2(error / tolerance / _SAFETY))
+            self.known = replace(known, level=min(level + max(more, 1), self._most))
+            return False
+        if is_large and known.is_new:
+            raise self._too_coarse(bends, error)
+        if tolerance is not None and error < _EASY * tolerance:
             level = max(level - 1, 0)
+        jumps, is_new = is_large and known.slopes is not None, is_large and known.slopes is None
         rates = tuple((end - start) / span.size for start, end in zip(starts, ends, strict=True))
-        self.known = replace(known, slopes=None if jumps else rates, size=span.size, level=level)
+        self.known = replace(known, slopes=None if jumps else rates, size=span.size, level=level, is_new=is_new)
         return True
 
     def _without_solution(self) -> StepFailed:

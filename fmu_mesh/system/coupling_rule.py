@@ -31,7 +31,8 @@ __all__ = ["Consistent", "CouplingRule", "Line", "Term"]
 _JUMP: Final = 4.0
 _PART: Final = 0.1
 """A source jumps if its rate of change differs from the one before by more than `_JUMP` times that one, and if it
-changes by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the former."""
+changes by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the
+former."""
 
 Steps = TypeVar("Steps", int, NDArray[np.intp])
 
