@@ -8,7 +8,7 @@ from typing import Any
 
 from tests.helpers import FMUS
 
-__all__ = ["LINKS", "MASSES", "PARTS", "driven_masses", "masses"]
+__all__ = ["LINKS", "MASSES", "PARTS", "contradiction", "driven_masses", "masses"]
 
 LINKS = ("two.y -> one.u", "one.x -> two.u", "one.v -> two.w")
 """Of two masses, each an FMU or a component: the force, the position and the velocity."""
@@ -70,14 +70,21 @@ class Loop(fmu_mesh.Component):
         self.y = self.gain * self.u + 1.0
 
 
-class Kinked(Loop):
-    "An output without a derivative where it crosses 0: no J fits both sides."
+class Late(Loop):
+    "As a loop, but it is closed in the first step only: at the start there is a solution."
 
     def initialize(self):
         self.y = 0.0
 
+
+class Relay(fmu_mesh.Component):
+    "From 0.01 s on, its output contradicts its input."
+
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output(0.0, depends_on=("u",))
+
     def step(self, time, step_size):
-        self.y = 1.0 if self.u < 0.5 * time else 0.0
+        self.y = 1.0 if time > 0.005 and self.u < 0.4 else 0.0
 """
 
 
@@ -114,4 +121,17 @@ def driven_masses(fmu: Path, folder: Path, **group: Any) -> dict[str, Any]:  # n
         ],
         "scenario": {"events": [{"at": 0.2, "set": {"two.bias": 5.0}}, {"at": 0.31, "set": {"two.bias": 0.0}}]},
         "record": {"file": "driven.csv", "variables": ["one.x", "one.v", "two.y", "two.x", "back.y", "pendulum.a"]},
+    }
+
+
+def contradiction(folder: Path, **group: Any) -> dict[str, Any]:  # noqa: ANN401  keys of a group
+    """A group without a solution from the second point on. The sections are those of `write_config`."""
+    (folder / "parts.py").write_text(PARTS, encoding="utf-8")
+    return {
+        "instances": {
+            "relay": {"python": "parts.py:Relay", "group": {"name": "g", "solve": "newton", **group}},
+            "echo": {"python": "parts.py:Loop", "group": "g"},
+        },
+        "connections": ["relay.y -> echo.u", {"from": "echo.y", "to": "relay.u", "offset": -1.0}],
+        "simulation": {"step_size": 0.01},
     }

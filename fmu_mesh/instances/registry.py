@@ -26,7 +26,7 @@ from ..variables.model_description import ModelDescription
 from .contract import Instance, Kind, Opening, Showing
 from .held_instance import HeldInstance
 from .midpoint_inputs import MidpointInputs
-from .tight_group import TightMember
+from .tight_member import TightMember
 
 __all__ = [
     "GROUP",

@@ -36,7 +36,6 @@ from ..errors import (
     from_report,
 )
 from ..instances.contract import Instance, LogMessage
-from ..instances.tight_group import solve_together
 from ..rings.host_memory import ONE_CORE, HostMemory
 from ..rings.row_streams import RowStreams
 from ..system.live_keys import KeyValue
@@ -260,7 +259,6 @@ class Node:
         for item in plan.instances:
             own, instance = given.get(item.name, ()), self._open_instance(item.name)
             instances[item.name] = with_times(instance, item, plan.grid, self._warn, own)
-        solve_together(plan.groups, instances)
         self._activity.enter("waiting for the mesh")
         self._membership.keys(plan.timeouts.start)
         self._memory = self._membership.memory or self._own_memory

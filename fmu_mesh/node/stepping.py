@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol, cast
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
 from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
+from ..instances.tight_group import solve_together
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -322,6 +323,7 @@ def connect(
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
         runner.sources.extend(sources_of(runner, rows, points))
+    solve_together(plan.groups, {name: runner.instance for name, runner in runners.items()})
     for group in plan.groups:
         first, *others = (runners[name] for name in group.members)
         first.solve_with(others)

@@ -16,7 +16,6 @@ from ..errors import FmuError, TerminationRequested
 from ..instances.call_guard import CallWatch, Guarded, Unwatched
 from ..instances.contract import Instance, LogMessage
 from ..instances.process_state import ProcessState
-from ..instances.tight_group import solve_together
 from ..node.burst_engine import make_engine
 from ..node.engine import Engine
 from ..node.initialization import Initialization
@@ -118,9 +117,6 @@ class HostedSystem:
             self._begins_again = self._begins_again and timed is instance
             inputs = Ring(item.input_row, 1, self.memory.beside(row_bytes(item.input_row)))
             self.runners[item.name] = Runner(item, timed, node.grid, ring, counter, inputs=inputs)
-        solve_together(
-            node.groups, {own.name: guarded for own, guarded in zip(node.instances, self._instances, strict=True)}
-        )
         connect(node, self.runners, self.memory, self.memory)
 
     def begin(self, start_values: Mapping[str, Mapping[str, PlainValue]]) -> Engine:

@@ -133,7 +133,11 @@ def check_solved_groups(
         sizes = {name: config.instances[name].step_size or config.simulation.step_size for name in members}
         if len({*sizes.values()}) > 1:
             shown = listed([f"{size:g} s of '{name}'" for name, size in sizes.items()])
-            findings.add(f"instances.{members[0]}.group", f"'{group}' is solved, and has the step sizes {shown}", "one")
+            findings.add(
+                f"instances.{members[0]}.group",
+                f"'{group}' is solved, and has the step sizes {shown}",
+                "one for all members",
+            )
         for name in members:
             for key, found, expected in _why_not(name, config, descriptions[name], own):
                 findings.add(f"instances.{name}.{key}", f"{found}, in the group '{group}', which is solved", expected)

@@ -38,7 +38,7 @@ from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_n
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
-from fmu_mesh.system.solved_groups import blocks_of, check_solved_groups
+from fmu_mesh.system.solved_groups import check_solved_groups
 from fmu_mesh.system.start_values import check_substitutes, forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
@@ -200,8 +200,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     doors = _check_zenoh(loaded, collected)
     if len(collected):
         collected.merge(obstacles or ())
-        how = config.simulation.algorithm
-        execution_order([*instances], connections, how, collected, None, blocks_of(config))  # for its findings
+        execution_order([*instances], connections, config, collected)  # for its findings
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
         missing = [name for name in config.instances if name not in descriptions]

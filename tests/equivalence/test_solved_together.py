@@ -93,7 +93,7 @@ def test_copies_give_the_floats_of_a_system(written: Callable[..., Path], tmp_pa
 
 
 @both
-def test_a_restored_system_and_a_state_in_a_file_go_on_with_the_same_floats(
+def test_restored_and_written_states_go_on_with_the_same_floats(
     written: Callable[..., Path], tmp_path: Path, name: str
 ) -> None:
     mesh = fmu_mesh.load(written(tmp_path, name))

@@ -166,7 +166,7 @@ MODELS = {
             Var("u", "continuous", 0.0),
             Var("w", "continuous", 0.0),
         ),
-        integers=(Var("masses", "fixed", 0),),
+        integers=(Var("masses", "fixed", 0), Var("stays", "fixed", 0)),
     ),
     "Rotor": Model(
         states=1,

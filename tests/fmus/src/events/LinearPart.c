@@ -2,12 +2,13 @@
  *
  * A part of a coupled linear system. Of order 1: x' = a x + b u + e w, y = c x + d u + f w. With `masses` 1, a mass that
  * is pushed: x' = v, v' = -a x - b v + u. With `masses` 2, one that is coupled by a spring and a damper of its own to a
- * mass at u with the velocity w: v' = -a x - b v - y, y = e (x - u) + c (v - w).
+ * mass at u with the velocity w: v' = -a x - b v - y, y = e (x - u) + c (v - w). With `stays`, it goes back to no state
+ * after 0.055 s.
  */
 #include "model.h"
 
 enum { X, V, DER_X, DER_V, Y, A, B, E, C, D, F, U, W };
-enum { MASSES };
+enum { MASSES, STAYS };
 
 void model_start(Model *m) { (void)m; }
 
@@ -39,6 +40,8 @@ Update model_event(Model *m)
     (void)m;
     return (Update){false, false, false};
 }
+
+bool model_refuses_state(const Model *m) { return m->i[STAYS] != 0 && m->time > 0.055; }
 
 bool model_completed_step(Model *m)
 {
