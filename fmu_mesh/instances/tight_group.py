@@ -30,7 +30,7 @@ from ..errors import StepFailed
 from ..rings.array_elements import scaled
 from ..system.consistent_outputs import solve
 from ..system.solved_groups import SolvedGroup
-from ..text import listed
+from ..text import counted, listed
 from .contract import Instance
 from .instance_wrapper import AroundInstance
 from .tight_member import GroupState, Span, TightMember
@@ -76,7 +76,8 @@ class _TightGroup:
         self._targets = [by_name[own.target] for own in plan.unknowns]
         self._most = _FINEST if plan.step_tolerance is not None else 0
         self._left: list[tuple[float, float]] = []  # what the last try has left of each unknown, and its value
-        self._members[0].lead(self.step)
+        self._points = self._steps = self._tries = 0
+        self._members[0].lead(self.step, self._cost)
 
     @property
     def _known(self) -> GroupState:
@@ -84,6 +85,10 @@ class _TightGroup:
 
     def _note(self, **changes: Any) -> None:  # noqa: ANN401  fields of the state
         self._members[0].note(replace(self._known, **changes))
+
+    def _cost(self) -> str:
+        points, group = counted(self._points, "point"), self._plan.name
+        return f"the group '{group}' took {counted(self._steps, 'step')} and {self._tries} tries for {points}"
 
     def step(self, step: int) -> None:
         """Own step ``step`` of all members."""
@@ -104,6 +109,8 @@ class _TightGroup:
             if self._try(Span(number, math.ldexp(size, -level), place / whole, (place + part) / whole), starts, level):
                 place += part
                 starts = self._given()
+                self._steps += 1
+        self._points += 1
         for member in self._members:
             member.put(step + 1)
         if bound:
@@ -145,6 +152,7 @@ class _TightGroup:
         for number in range(_MOST_TRIES):
             if number:
                 self._go_back(states)
+            self._tries += 1
             for member in self._members:
                 member.take(span, starts, ends, goes_on=slopes is not None)
             given = self._given()

@@ -6,9 +6,9 @@ What the values are, and which steps are taken, is `fmu_mesh.instances.tight_gro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple, Protocol, cast
+from typing import Any, Final, NamedTuple, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -17,7 +17,7 @@ from ..errors import FmuError
 from ..rings.ring import Ring
 from ..simtime import TimeGrid
 from ..system.coupling_rule import Line
-from .contract import Instance, KeepsFiles, Opening
+from .contract import Instance, KeepsFiles, LogMessage, Opening
 from .instance_wrapper import AroundInstance, of_kind, packed, unpacked
 
 __all__ = ["GroupState", "Span", "TightMember"]
@@ -26,12 +26,6 @@ _NO_WAY_BACK: Final = (
     "In a group with `solve: newton`, each member goes back to the start of a step: leave out `solve`, or move this "
     "instance out of the group."
 )
-
-
-class _FollowsLines(Protocol):
-    """An instance whose inputs may change linearly over a step, as an FMU does; see `FmuInstance`."""
-
-    def set_input_derivatives(self, derivatives: Mapping[str, float], *, continuous: bool = False) -> None: ...
 
 
 class GroupState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,12 +88,14 @@ class TightMember(AroundInstance[Instance]):
         self._lines: list[Line] = []
         self._ends: list[tuple[float, float]] = []  # of each outside line over the point
         self._step: Callable[[int], None] | None = None  # of all members, if it is the first one
+        self._tell: Callable[[], str] | None = None
+        self._log = opening.log
         self.known = GroupState()
         self._goes_on = False
 
-    def lead(self, step: Callable[[int], None]) -> None:
-        """The step of this member is that of the group."""
-        self._step = step
+    def lead(self, step: Callable[[int], None], tell: Callable[[], str]) -> None:
+        """The step of this member is that of the group, and at the end it says what that has cost."""
+        self._step, self._tell = step, tell
 
     def note(self, known: GroupState) -> None:
         """Keep what the group knows; only the first member is asked for it."""
@@ -168,7 +164,7 @@ class TightMember(AroundInstance[Instance]):
                 self._floats[self._columns[name]], beyond[name] = 0.5 * (start + end), 0.5 * (end - start)
         if slopes:
             within = goes_on and (self._goes_on or span.first > 0.0)
-            cast("_FollowsLines", self._instance).set_input_derivatives(slopes, continuous=within)
+            cast("Any", self._instance).set_input_derivatives(slopes, continuous=within)  # an FMU, by its description
         self._instance.do_step(span.number)
         for part, column, inputs_of in self._corrected:
             for name, value in inputs_of.items():
@@ -183,6 +179,13 @@ class TightMember(AroundInstance[Instance]):
         for ring, own in zip(self._outputs, self._made, strict=True):
             for part, made in zip(ring.parts, own.parts, strict=True):
                 part[step & ring.mask] = made[0]
+
+    def close(self) -> None:
+        """See `Instance`."""
+        if self._tell is not None:
+            self._log(LogMessage(self.name, "OK", "group", self._tell(), -1))
+            self._tell = None
+        super().close()
 
     def remove_files(self) -> None:
         """See `KeepsFiles`."""

@@ -213,7 +213,10 @@ def _groups(plan: Plan) -> list[str]:
     config, instances = plan.system.config, plan.system.instances
     edges = [(c.source_instance, c.target_instance) for c in plan.connections if not c.initial_only]
     automatic = automatic_nodes(config, edges, claims_in(plan))
-    lines = []
+    lines = [
+        f"  '{own.name}' is solved at each point: {listed([str(unknown) for unknown in own.unknowns])}"
+        for own in plan.groups
+    ]
     for cycle in plan.cycles:
         names = ", ".join(sorted(cycle, key=[*instances].index))
         now = {plan.node_of(name) for name in cycle}

@@ -76,7 +76,7 @@ def exponential(a: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return result
 
 
-def part(starts: Starts) -> tuple[list[list[float]], ...]:
+def part(starts: Starts) -> tuple[Any, ...]:
     """The matrices A, B, C and D of a `LinearPart`; the outputs are x, v and y, the inputs u and w."""
     a, b, e, c, d, f = (starts.get(name, 0.0) for name in "abecdf")
     match starts.get("masses", 0):
@@ -181,6 +181,15 @@ def test_components_whose_inputs_are_means_are_of_order_2(event_fmu: EventFmu, t
 
     assert errors[0] < 0.03
     assert math.log2(errors[1] / errors[2]) == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_log_says_what_a_group_has_cost(event_fmu: EventFmu, tmp_path: Path) -> None:
+    config, said = write_config(tmp_path, instances=masses(event_fmu("LinearPart", 2)), connections=LINKS), list[str]()
+
+    fmu_mesh.load(config).run(processes=False, on_event=lambda event: said.append(str(event)))
+
+    # Two tries for a point: the parts are linear, and the Jacobian is measured once.
+    assert any("the group 'g' took 1000 steps and 2000 tries for 1000 points" in text for text in said), said
 
 
 def test_step_control_makes_errors_smaller_with_points_that_are_far_apart(event_fmu: EventFmu, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from fmu_mesh.errors import ConfigurationError
+from fmu_mesh.pictures.plan_page import plan_page
 from fmu_mesh.system.plan import RECORDER, Plan
 from tests.helpers import write_config
 from tests.planning import prepare
@@ -147,3 +148,9 @@ def test_a_direct_dependence_that_is_not_known_is_refused(event_fmu: EventFmu, t
             "by 'u' is no constant; expected `feedthrough: {y: {u: ...}}` there, or no `solve`"
         )
     ]
+
+
+def test_check_names_the_unknowns(event_fmu: EventFmu, tmp_path: Path) -> None:
+    page = plan_page(plan_of(tmp_path, masses(event_fmu("LinearPart", 2))))
+
+    assert "  'g' is solved at each point: one.u, two.u, two.w" in page
