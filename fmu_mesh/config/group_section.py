@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import isfinite
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta
 
 from fmu_mesh.config.base import POSITIVE, Base, Name
 from fmu_mesh.config.findings import Findings
 
-__all__ = ["Group", "GroupConfig", "StepControlConfig", "group_name", "solved_groups_of"]
+__all__ = ["Group", "GroupConfig", "Member", "StepControlConfig", "group_name", "solved_groups_of"]
 
 
 class StepControlConfig(Base, frozen=True, kw_only=True):
@@ -57,22 +57,24 @@ Group = Annotated[
 ]
 
 
-class _Grouped(Protocol):
-    @property
-    def group(self) -> str | GroupConfig | None: ...
+class Member(NamedTuple):
+    """What of an instance matters to its group: the key, its step size in s, and whether a failure does not end it."""
+
+    group: str | GroupConfig | None
+    step_size: float
+    holds: bool
 
 
-def group_name(section: _Grouped) -> str | None:
-    """The name of the group of an instance; None if it has none."""
-    own = section.group
-    return own.name if isinstance(own, GroupConfig) else own
+def group_name(group: str | GroupConfig | None) -> str | None:
+    """The name of the group that an instance has."""
+    return group.name if isinstance(group, GroupConfig) else group
 
 
-def solved_groups_of(sections: Mapping[str, _Grouped], findings: Findings | None = None) -> dict[str, GroupConfig]:
+def solved_groups_of(members: Mapping[str, Member], findings: Findings | None = None) -> dict[str, GroupConfig]:
     """The groups that are solved, by name; a finding for each member that says something else than one before it."""
     found: dict[str, tuple[str, GroupConfig]] = {}
-    for name, section in sections.items():
-        own, place = section.group, f"instances.{name}.group"
+    for name, member in members.items():
+        own, place = member.group, f"instances.{name}.group"
         if not isinstance(own, GroupConfig):
             continue
         first, known = found.setdefault(own.name, (place, own))

@@ -220,7 +220,7 @@ def _groups(plan: Plan) -> list[str]:
     for cycle in plan.cycles:
         names = ", ".join(sorted(cycle, key=[*instances].index))
         now = {plan.node_of(name) for name in cycle}
-        would = {automatic.get(name, group_name(config.instances[name]) or name) for name in cycle}
+        would = {automatic.get(name, group_name(config.instances[name].group) or name) for name in cycle}
         if len(now) > 1:
             cost = f"{names} form a cycle over {len(now)} nodes: each point costs a round trip"
             lines.append(f"  {cost}; {_remedy(len(now), len(would))}")

@@ -46,7 +46,7 @@ def with_feedthrough(
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         answers = threads.map(lambda name: _answer(system, sections, name, questions[name], findings), questions)
         known = dict(zip(questions, answers, strict=True))
-    blocks = blocks_of(system.config)
+    blocks = blocks_of(system.config.members)
     edges = [(c.source_instance, c.target_instance) for c in system.connections if not c.initial_only]
     cycles = [part for part in strongly_connected(system.instances, edges) if is_cycle(part, edges)]
     for name, answer in known.items():
@@ -73,7 +73,7 @@ def _questions(system: ResolvedSystem) -> dict[str, _Question]:
     outputs: dict[str, dict[str, None]] = {}
     instances, blocks, everywhere = (
         system.instances,
-        blocks_of(system.config),
+        blocks_of(system.config.members),
         system.config.simulation.loops == "solved",
     )
     for c in system.connections:

@@ -190,7 +190,7 @@ def planned(
         check_messages(name, own.description, (*own.keys_in, *own.keys_out), obstacles)
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
-    if loaded.config.simulation.loops == "solved" or blocks_of(loaded.config):
+    if loaded.config.simulation.loops == "solved" or blocks_of(loaded.config.members):
         system = with_feedthrough(system, sections, findings, warnings)
         findings.raise_any()
     _check_host(loaded.config, obstacles, warnings)

@@ -8,12 +8,11 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from ..config.findings import Findings
-from ..config.mesh import Config
 from .connections import Connection
 from .coupling_rule import Consistent
 from .feeds import consistent_columns
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
-from .solved_groups import Blocks, blocks_of, within_block
+from .solved_groups import Blocks, within_block
 
 __all__ = ["ExecutionOrder", "execution_order"]
 
@@ -27,11 +26,12 @@ class ExecutionOrder(NamedTuple):
     cycles: tuple[tuple[str, ...], ...]
 
 
-def execution_order(
+def execution_order(  # noqa: PLR0913, PLR0917  what the order follows from
     names: Collection[str],
     connections: Sequence[Connection],
-    config: Config,
+    algorithm: str,
     findings: Findings,
+    blocks: Blocks,
     consistent: Mapping[tuple[str, str], Consistent] | None = None,
 ) -> ExecutionOrder:
     """The connections between instances with their delays, the order of the instances, and the cycles.
@@ -42,7 +42,6 @@ def execution_order(
     Raises:
         ConfigurationError: there is one; has all findings.
     """
-    blocks, algorithm = blocks_of(config), config.simulation.algorithm
     vertices = [name for name in names if blocks.get(name, name) == name]
     connections = [replace(c, delay=1) if within_block(c, blocks) else c for c in connections]
     if consistent is not None:

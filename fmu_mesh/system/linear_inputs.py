@@ -47,7 +47,7 @@ def with_extrapolation(
 
     What is said for an instance or for all holds for the inputs that can change within a step.
     """
-    found, blocks = [], blocks_of(config)
+    found, blocks = [], blocks_of(config.members)
     for c in connections:
         own, target = c.extrapolation, config.instances[c.target_instance]
         general, place = target.extrapolation, f"instances.{c.target_instance}.extrapolation"

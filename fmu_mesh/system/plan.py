@@ -245,14 +245,15 @@ def make_plan(
         ConfigurationError: a cycle has no delay; names the cycle.
     """
     findings = Findings(system.config.mesh) if findings is None else findings
-    names = [*system.instances]
+    names, how = [*system.instances], system.config.simulation.algorithm
     points = {name: own.step_points for name, own in system.instances.items()}
-    blocks = blocks_of(system.config)  # their outputs are consistent as they are
+    blocks = blocks_of(system.config.members)  # their outputs are consistent as they are
     direct = {name: own for name, own in system.feedthrough.items() if name not in blocks}
     consistent = consistent_outputs(system.connections, direct, points, findings)
     solved = consistent if system.config.simulation.loops == "solved" else None
-    connections, closing, order, cycles = execution_order(names, system.connections, system.config, findings, solved)
-    groups = solved_groups(system.config, connections, order, system.feedthrough)
+    made = execution_order(names, system.connections, how, findings, blocks, solved)
+    connections, closing, order, cycles = made
+    groups = solved_groups(system.config.members, connections, order, system.feedthrough)
     system = replace(system, records=tuple(record.with_consistent(consistent) for record in system.records))
     initialization = plan_initialization(system, connections)
     check_loops(initialization, connections, {n: own.description for n, own in system.instances.items()}, findings)

@@ -28,7 +28,7 @@ Edges = dict[tuple[Vertex, Vertex], Connection | None]
 
 def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
     """Add a warning for each loop at every point, and one for all outputs that may close one."""
-    blocks = blocks_of(plan.system.config)
+    blocks = blocks_of(plan.system.config.members)
     delayed = [c for c in plan.connections if not is_solved(c, blocks)]
     declared, assumed = _edges(delayed) if plan.cycles else ({}, {})
     for loop, inside in _loops(declared):

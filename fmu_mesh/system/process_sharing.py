@@ -70,7 +70,7 @@ def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: Cl
     share a node, nor do two that cannot share a process. The edges are those of all connections between instances.
     """
     position = {name: place for place, name in enumerate(config.instances)}
-    groups = map(group_name, config.instances.values())
+    groups = (group_name(instance.group) for instance in config.instances.values())
     taken = {*config.instances, *(group for group in groups if group is not None)}
     nodes: dict[str, str] = {}
     cycles = [sorted(part, key=position.__getitem__) for part in strongly_connected(config.instances, edges)]

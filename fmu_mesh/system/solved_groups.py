@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import msgspec
 
 from ..config.findings import Findings
-from ..config.group_section import GroupConfig, group_name, solved_groups_of
-from ..config.mesh import Config
+from ..config.group_section import GroupConfig, Member, group_name, solved_groups_of
 from ..text import listed
 from ..variables.model_description import ModelDescription
 from .connections import Connection
@@ -70,11 +69,11 @@ class SolvedGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feedthrough: dict[str, dict[str, dict[str, float]]]
 
 
-def blocks_of(config: Config) -> Blocks:
+def blocks_of(members: Mapping[str, Member]) -> Blocks:
     """The solved groups of a configuration."""
-    solved, first, found = solved_groups_of(config.instances), dict[str, str](), dict[str, str]()
-    for name, section in config.instances.items():
-        if (group := group_name(section)) in solved:
+    solved, first, found = solved_groups_of(members), dict[str, str](), dict[str, str]()
+    for name, member in members.items():
+        if (group := group_name(member.group)) in solved:
             found[name] = first.setdefault(str(group), name)
     return found
 
@@ -93,12 +92,12 @@ def within_block(connection: Connection, blocks: Blocks) -> bool:
 
 
 def solved_groups(
-    config: Config, connections: Sequence[Connection], order: Sequence[str], feedthrough: Feedthrough
+    configured: Mapping[str, Member], connections: Sequence[Connection], order: Sequence[str], feedthrough: Feedthrough
 ) -> tuple[SolvedGroup, ...]:
     """The solved groups of a plan with these connections and this order of instances."""
-    blocks, found = blocks_of(config), list[SolvedGroup]()
-    for group, own in solved_groups_of(config.instances).items():
-        members = tuple(name for name in order if name in blocks and group_name(config.instances[name]) == group)
+    blocks, found = blocks_of(configured), list[SolvedGroup]()
+    for group, own in solved_groups_of(configured).items():
+        members = tuple(name for name in order if group_name(configured[name].group) == group)
         inner = [c for c in connections if c.target_instance in members and is_solved(c, blocks)]
         unknowns = tuple(
             Unknown(c.target_instance, target, c.source_instance, source, c.factor, c.offset)
@@ -121,16 +120,16 @@ def solved_groups(
 
 
 def check_solved_groups(
-    config: Config,
+    configured: Mapping[str, Member],
     descriptions: Mapping[str, ModelDescription],
     connections: Sequence[Connection],
     findings: Findings,
 ) -> None:
     """Add a finding for each member that cannot be in a group that is solved, and for each group without unknowns."""
-    groups, blocks = solved_groups_of(config.instances, findings), blocks_of(config)
+    groups, blocks = solved_groups_of(configured, findings), blocks_of(configured)
     for group, own in groups.items():
-        members = [name for name in descriptions if group_name(config.instances[name]) == group]
-        sizes = {name: config.instances[name].step_size or config.simulation.step_size for name in members}
+        members = [name for name in descriptions if group_name(configured[name].group) == group]
+        sizes = {name: configured[name].step_size for name in members}
         if len({*sizes.values()}) > 1:
             shown = listed([f"{size:g} s of '{name}'" for name, size in sizes.items()])
             findings.add(
@@ -139,7 +138,7 @@ def check_solved_groups(
                 "one for all members",
             )
         for name in members:
-            for key, found, expected in _why_not(name, config, descriptions[name], own):
+            for key, found, expected in _why_not(name, configured[name], descriptions[name], own):
                 findings.add(f"instances.{name}.{key}", f"{found}, in the group '{group}', which is solved", expected)
         inner = [c for c in connections if within_block(c, blocks) and c.target_instance in members]
         for c in inner:
@@ -151,7 +150,7 @@ def check_solved_groups(
 
 
 def _why_not(
-    name: str, config: Config, description: ModelDescription, own: GroupConfig
+    name: str, member: Member, description: ModelDescription, own: GroupConfig
 ) -> Iterator[tuple[str, str, str]]:
     """What prevents that an instance is a member: the key, what was found, and what is expected."""
     version = description.fmi_version
@@ -159,7 +158,7 @@ def _why_not(
         flag = f"canGetAndSetFMU{'s' if version[:1] == '2' else 'S'}tate"
         why = "FMI 1.0 has no states" if version[:1] == "1" else f"its model description does not have {flag}"
         yield "group", f"'{name}' has no state to go back to ({why})", "another group, or one without `solve`"
-    if config.instances[name].on_failure != "stop":
+    if member.holds:
         yield "on_failure", "an instance whose outputs are held after a failure", "stop"
     fixed = version and description.kind == "co_simulation" and not description.can_handle_variable_step_size
     if own.step_control is not None and (fixed or (not version and description.fixed_step_size is not None)):
