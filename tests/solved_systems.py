@@ -31,6 +31,8 @@ class Mass(fmu_mesh.Component):
     push = fmu_mesh.Input()
     back = fmu_mesh.Input()
     bias = fmu_mesh.Input()
+    ramp = fmu_mesh.Input()
+    free = fmu_mesh.Input()
     y = fmu_mesh.Output(depends_on=("u", "w"))
     x = fmu_mesh.Output(depends_on=())
 
@@ -44,7 +46,7 @@ class Mass(fmu_mesh.Component):
 
     def slopes(self, x, v):
         force = 1000.0 * (x - self.u) + 10.0 * (v - self.w)
-        return v, -100.0 * x - 2.0 * v - force + self.push + self.bias - 0.1 * self.back
+        return v, -100.0 * x - 2.0 * v - force + self.push + self.bias + self.ramp + self.free - 0.1 * self.back
 
     def step(self, time, step_size):
         h = step_size / 10
@@ -119,7 +121,10 @@ def driven_masses(fmu: Path, folder: Path, **group: Any) -> dict[str, Any]:  # n
             "one.x -> back.u",
             "back.y -> two.back",
         ],
-        "scenario": {"events": [{"at": 0.2, "set": {"two.bias": 5.0}}, {"at": 0.31, "set": {"two.bias": 0.0}}]},
+        "scenario": {
+            "values": {"two.ramp": {"times": [0.1, 0.8], "values": [0.0, 30.0], "interpolation": "linear"}},
+            "events": [{"at": 0.2, "set": {"two.bias": 5.0}}, {"at": 0.31, "set": {"two.bias": 0.0}}],
+        },
         "record": {"file": "driven.csv", "variables": ["one.x", "one.v", "two.y", "two.x", "back.y", "pendulum.a"]},
     }
 

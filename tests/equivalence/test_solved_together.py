@@ -80,6 +80,21 @@ def test_processes_without_the_library_give_the_same_floats(place: Place, writte
     assert config.with_suffix(".csv").read_bytes() == (place.folder / "local.csv").read_bytes()
 
 
+def test_a_value_sent_with_a_time_to_the_second_member_is_used(written: Callable[..., Path], tmp_path: Path) -> None:
+    """From the first such value on, the member follows times, while the first member takes its steps."""
+    mesh = fmu_mesh.load(written(tmp_path, "one step"))
+    with mesh.start(paused=True, output=tmp_path / "sent.csv") as run:
+        run.set("two.free", 40.0, at=0.5)
+        run.resume()
+        sent = run.wait()
+
+    without = mesh.run(processes=False, record="memory")
+    mesh.scenario(events=[{"at": 0.5, "set": {"two.free": 40.0}}])
+    prescribed = mesh.run(processes=False, record="memory")
+    assert [name for name in sent if sent[name].tobytes() != prescribed[name].tobytes()] == []
+    assert (sent["two.x"] == without["two.x"]).sum() == 51
+
+
 @both
 def test_copies_give_the_floats_of_a_system(written: Callable[..., Path], tmp_path: Path, name: str) -> None:
     mesh = fmu_mesh.load(written(tmp_path, name))
