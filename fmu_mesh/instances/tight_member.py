@@ -91,6 +91,7 @@ class TightMember(AroundInstance[Instance]):
         self._tell: Callable[[], str] | None = None
         self._log = opening.log
         self.known = GroupState()
+        self.is_stepping = False  # for any thread
         self._goes_on = False
 
     def lead(self, step: Callable[[int], None], tell: Callable[[], str]) -> None:
@@ -165,7 +166,9 @@ class TightMember(AroundInstance[Instance]):
         if slopes:
             within = goes_on and (self._goes_on or span.first > 0.0)
             cast("Any", self._instance).set_input_derivatives(slopes, continuous=within)  # an FMU, by its description
+        self.is_stepping = True
         self._instance.do_step(span.number)
+        self.is_stepping = False
         for part, column, inputs_of in self._corrected:
             for name, value in inputs_of.items():
                 part[0, column] += value * beyond[name]

@@ -210,7 +210,8 @@ class Engine(ABC):
     @property
     def current(self) -> Runner | None:
         """The runner whose step is under way, or has failed; from any thread."""
-        return next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
+        busy = next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
+        return busy.stepping if busy is not None else None
 
     @property
     def spent_s(self) -> list[float]:

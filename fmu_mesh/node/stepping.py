@@ -14,6 +14,7 @@ from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
 from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
 from ..instances.tight_group import solve_together
+from ..instances.tight_member import TightMember
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -151,6 +152,12 @@ class Runner:
             return self.instance.do_step
         return self._step_together if len(self._together) > 1 else _is_done
 
+    @property
+    def stepping(self) -> Runner:
+        """Itself; while it takes the steps of a solved group, the member whose instance steps. From any thread."""
+        members = ((own, cast("AroundInstance[Instance]", own.instance).within(TightMember)) for own in self._together)
+        return next((own for own, member in members if member.is_stepping), self)
+
     def _step_together(self, step: int) -> None:
         for runner in self._together:
             runner.instance.do_step(step)
@@ -281,7 +288,7 @@ class Runner:
         if source is None:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]
-        return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
+        return f"'{source.instance}.{output}', which feeds '{source.transfer.target}.{own}'"
 
 
 _NO_WAYS = Ways()

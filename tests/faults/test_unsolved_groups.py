@@ -10,6 +10,7 @@ import pytest
 import fmu_mesh
 from fmu_mesh.errors import StepFailed
 from fmu_mesh.run.options import PlanOptions
+from tests.fmus.helpers import find_fmu
 from tests.helpers import Place, row_count, wait_until, write_config
 from tests.plain_run import PlainRun
 from tests.planning import prepare
@@ -72,6 +73,29 @@ def test_a_tolerance_of_step_control_that_cannot_be_met_is_said(event_fmu: Calla
         StepFailed, match=r"instance one, point 0, .*the tolerance 1e-09 of `step_control` cannot be met"
     ):
         fmu_mesh.load(config).run(processes=False)
+
+
+def test_a_member_that_hangs_in_a_try_is_named(place: Place) -> None:
+    (place.folder / "parts.py").write_text(PARTS, encoding="utf-8")
+    config = write_config(
+        place.folder,
+        instances={
+            "echo": {
+                "python": "parts.py:Loop",
+                "start_values": {"gain": 0.5},
+                "group": {"name": "g", "solve": "newton"},
+            },
+            "faulty": {"fmu": str(find_fmu("Faulty", place.folder)), "group": "g", "start_values": {"hang_at": 0.0205}},
+        },
+        connections=["echo.y -> faulty.u", "faulty.y -> echo.u"],
+        timeouts={"step": 1.0},
+    )
+
+    launched = place.run("launch", config, "--no-progress")
+
+    assert launched.wait() == 3, launched.story()
+    assert "instance faulty, point 20, t = 0.02 s: the FMU has not returned for 1." in launched.message
+    place.assert_nothing_left(within_s=10.0)
 
 
 def test_a_killed_node_with_a_group_starts_again_with_the_same_floats(
