@@ -223,7 +223,7 @@ class Mesh:
         component: object = None,
         start_values: Mapping[str, Any] | None = None,
         step_size: float | None = None,
-        group: str | None = None,
+        group: str | Mapping[str, Any] | None = None,
         replace: bool = False,
         **section: Any,  # noqa: ANN401  the kind of instance says what it takes
     ) -> None:
@@ -241,7 +241,7 @@ class Mesh:
             fmu: path of an FMU; instances of other kinds have their own key, such as ``mujoco="world.xml"``.
             start_values: by variable; an array as nested lists or as a numpy array.
             step_size: step size of this instance in s, a whole multiple of that of the mesh.
-            group: instances of one group share one process.
+            group: instances of one group share one process; ``{"name": "g", "solve": "newton"}`` also solves it.
             replace: whether it takes the place of an instance of this name, whose connections stay.
             section: any other key of the section of an instance in a configuration file.
 

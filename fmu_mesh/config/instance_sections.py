@@ -20,6 +20,7 @@ from msgspec.structs import replace
 
 from fmu_mesh.config.base import POSITIVE, Base, Name
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.group_section import Group, GroupConfig
 from fmu_mesh.variables.model_description import ModelDescription
 from fmu_mesh.variables.value_types import PlainValue
 
@@ -73,7 +74,6 @@ StepSize = Annotated[
         extra_json_schema=POSITIVE,
     ),
 ]
-Group = Annotated[Name | None, Meta(description="Instances of one group share one node (one process).")]
 NotFinitePolicy = Annotated[
     Literal["stop", "record"] | None,
     Meta(
@@ -233,7 +233,7 @@ class InstanceSection:
         start_values: by variable name, as written in the file.
         inputs: what inputs that are not connected do, by variable name.
         step_size: of the instance in s; None: the base step size.
-        group: the group that shares one node; None: none.
+        group: the group that shares one node, see `group_name`; None: none.
         host: the host on which the node runs, by its name in `deploy.hosts`; None: the one of `launch`.
         not_finite: what an output that is NaN or infinite means; None: what the simulation says.
         on_failure: what follows if the instance itself fails in a step.
@@ -253,7 +253,7 @@ class InstanceSection:
     start_values: Mapping[str, PlainValue] = MappingProxyType({})
     inputs: Mapping[str, InputConfig] = MappingProxyType({})
     step_size: float | None = None
-    group: str | None = None
+    group: str | GroupConfig | None = None
     host: str | None = None
     not_finite: Literal["stop", "record"] | None = None
     on_failure: Literal["stop", "hold"] | SubstitutesConfig = "stop"

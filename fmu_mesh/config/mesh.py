@@ -17,6 +17,7 @@ from msgspec import Meta
 from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig, ZenohConfig
 from fmu_mesh.config.base import Base, DeadlineSeconds, Name
 from fmu_mesh.config.deploy_section import DeployConfig
+from fmu_mesh.config.group_section import Member
 from fmu_mesh.config.instance_sections import (
     EXTRAPOLATIONS,
     KIND,
@@ -338,6 +339,15 @@ class Config(Base, frozen=True, kw_only=True):
         """The keys of other programs at ends of connections."""
         keyed = (one.key for one in self.connections if isinstance(one, KeyInputConfig | KeyOutputConfig))
         return tuple(dict.fromkeys(keyed))
+
+    @property
+    def members(self) -> dict[str, Member]:
+        """What of each instance matters to its group, by name."""
+        base = self.simulation.step_size
+        return {
+            name: Member(own.group, own.step_size or base, own.on_failure != "stop")
+            for name, own in self.instances.items()
+        }
 
     @property
     def engines(self) -> dict[str, PhysicsSection]:

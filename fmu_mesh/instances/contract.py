@@ -19,6 +19,7 @@ from ..files import below
 from ..simtime import TimeGrid
 from ..system.linear_inputs import LinearInput
 from ..system.process_sharing import Claims
+from ..system.solved_groups import SolvedGroup
 from ..variables.model_description import ModelDescription, Value
 from .kept_models import KeptModels
 
@@ -92,6 +93,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
         timeouts: how long its calls may take.
         linear_inputs: the inputs that change linearly within a step; only where the description allows it.
         midpoint_inputs: those that get the middle of the line of their source; not a matter of the kind.
+        group: the solved group that it is a member of, which then leads its ``linear_inputs``; None: there is none.
         log: call it with every message of the model, on the thread that calls the instance.
         showing: only given to a kind with `can_be_shown`.
         kept: where an instance may leave what the next one of its name can use again, in a process that runs a mesh
@@ -108,6 +110,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
     timeouts: TimeoutsConfig = TimeoutsConfig()
     linear_inputs: tuple[LinearInput, ...] = ()
     midpoint_inputs: tuple[LinearInput, ...] = ()
+    group: SolvedGroup | None = None
     log: Callable[[LogMessage], None] = lambda _message: None
     showing: Showing = Showing()
     kept: KeptModels | None = None

@@ -22,6 +22,7 @@ __all__ = ["AroundInstance", "AroundNativeSteps", "of_kind", "packed", "unpacked
 
 Within = TypeVar("Within", bound=Instance)
 Own = TypeVar("Own")
+Found = TypeVar("Found")
 Result = TypeVar("Result")
 
 
@@ -106,6 +107,10 @@ class AroundInstance(Generic[Within]):
         """From the next step on, undo after each step what it does to the state of the process."""
         if isinstance(self._instance, AroundInstance):
             self._instance.take_care()
+
+    def within(self, kind: type[Found]) -> Found:
+        """The wrapper of this kind around the same instance: there is one, at this place or farther inside."""
+        return self if isinstance(self, kind) else cast("AroundInstance[Any]", self._instance).within(kind)
 
     def _forward(self, call: Callable[..., Result], *arguments: Any) -> Result:  # noqa: ANN401 those of any method
         """Call a method of the inner instance."""

@@ -26,6 +26,7 @@ from ..variables.model_description import ModelDescription
 from .contract import Instance, Kind, Opening, Showing
 from .held_instance import HeldInstance
 from .midpoint_inputs import MidpointInputs
+from .tight_member import TightMember
 
 __all__ = [
     "GROUP",
@@ -151,12 +152,14 @@ def prepare(opening: Opening[Any]) -> None:
 
 
 def open_instance(opening: Opening[Any]) -> Instance:
-    """Open an instance of whatever kind, with its `midpoint` inputs and `on_failure`; the caller closes it."""
+    """Open an instance of whatever kind, with its `midpoint` inputs, `on_failure` and group; the caller closes it."""
     kind = _kind_of(opening.section)
     if opening.showing and not kind.can_be_shown:
         opening = replace(opening, showing=Showing())
     instance = kind.open(opening)
-    if opening.midpoint_inputs:
+    if opening.group is not None:
+        instance = TightMember(instance, opening)
+    elif opening.midpoint_inputs:
         instance = MidpointInputs(instance, opening.midpoint_inputs)
     return instance if opening.section.on_failure == "stop" else HeldInstance(instance, opening)
 

@@ -244,7 +244,7 @@ class BurstEngine(Engine):
         """How Python takes a step of a runner, whose inputs that are no texts are there."""
         if runner.player is not None:
             return partial(self._play, runner, runner.player)
-        do_step, is_timed = runner.instance.do_step, isinstance(runner.instance, TimedInputs)
+        do_step, is_timed = runner.do_step, isinstance(runner.instance, TimedInputs)
         may_fail = runner.plan.section.on_failure != "stop"
         texts = [source.transfer for source in runner.sources if source.transfer.has_text]
         if not texts and not is_timed and not may_fail:

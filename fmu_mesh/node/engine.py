@@ -210,7 +210,8 @@ class Engine(ABC):
     @property
     def current(self) -> Runner | None:
         """The runner whose step is under way, or has failed; from any thread."""
-        return next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
+        busy = next((own for own in self.runners if own.stage in _BUSY and own.step < own.last_step), None)
+        return busy.stepping if busy is not None else None
 
     @property
     def spent_s(self) -> list[float]:
@@ -316,7 +317,7 @@ class PlainEngine(Engine):
             for source in runner.sources if runner.player is None else ():
                 source.transfer.step(step)
             member.stage = Stage.IN_PYTHON
-            (runner.player.take if runner.player is not None else runner.instance.do_step)(step)
+            (runner.player.take if runner.player is not None else runner.do_step)(step)
             if not runner.is_finite.check(step + 1):
                 runner.not_finite(step)
         except FmuMeshError as error:

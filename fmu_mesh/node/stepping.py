@@ -13,6 +13,8 @@ from typing import NamedTuple, Protocol, cast
 from ..instances.call_guard import doing
 from ..instances.contract import Instance, StepsNatively
 from ..instances.instance_wrapper import AroundInstance, AroundNativeSteps
+from ..instances.tight_group import solve_together
+from ..instances.tight_member import TightMember
 from ..rings import native
 from ..rings.array_elements import fill_unconnected
 from ..rings.finite import FiniteRows
@@ -123,6 +125,7 @@ class Runner:
         self.counter = counter
         self.sources: list[Source] = []
         self.out_links: list[OutLink] = []
+        self._together: tuple[Runner, ...] = ()
         self.watched: Ring | None = None
         self.player: RowPlayer | None = None
         self.last_step = grid.last_point // plan.step_points
@@ -169,8 +172,37 @@ class Runner:
             gate.note(known=0)
 
     def _fill_unconnected(self) -> None:
-        connected = [own.target for source in self.sources for own in source.transfer.columns]
+        connected = [own.target for feed in self.plan.step_feeds for own in feed.columns]
         fill_unconnected(self.inputs, connected, self.instance.get_values)
+
+    def solve_with(self, others: Sequence[Runner]) -> None:
+        """Take the steps of a solved group, of which it is the first member: it needs what all of them read."""
+        self._together = (*others, self)
+        for other in others:
+            self.sources.extend(other.sources)
+            other.sources.clear()
+            other.follow_first()
+
+    def follow_first(self) -> None:
+        """The first member of its solved group takes its steps."""
+        self._together = (self,)
+
+    @property
+    def do_step(self) -> Callable[[int], None]:
+        """How its step is taken, when all sources have moved their values."""
+        if not self._together:
+            return self.instance.do_step
+        return self._step_together if len(self._together) > 1 else _is_done
+
+    @property
+    def stepping(self) -> Runner:
+        """Itself; while it takes the steps of a solved group, the member whose instance steps. From any thread."""
+        members = ((own, cast("AroundInstance[Instance]", own.instance).within(TightMember)) for own in self._together)
+        return next((own for own, member in members if member.is_stepping), self)
+
+    def _step_together(self, step: int) -> None:
+        for runner in self._together:
+            runner.instance.do_step(step)
 
     def begin(self) -> None:
         """The outputs after Initialization Mode, or of the state with which the run begins, are complete.
@@ -301,7 +333,7 @@ class Runner:
         if source is None:
             return "the master's grant"
         output, own = source.transfer.columns[0][:2]
-        return f"'{source.instance}.{output}', which feeds '{self.name}.{own}'"
+        return f"'{source.instance}.{output}', which feeds '{source.transfer.target}.{own}'"
 
 
 _NO_WAYS = Ways()
@@ -343,6 +375,10 @@ def connect(
     points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
         runner.sources.extend(sources_of(runner, rows, points))
+    solve_together(plan.groups, {name: runner.instance for name, runner in runners.items()})
+    for group in plan.groups:
+        first, *others = (runners[name] for name in group.members)
+        first.solve_with(others)
     return Connected(receivers, streamed)
 
 
@@ -363,6 +399,10 @@ def sources_of(
             )
             if transfer.columns:
                 yield Source(feed.source, transfer, counter)
+
+
+def _is_done(_step: int) -> None:
+    """The step of a member of a solved group that is not the first: that one has taken it."""
 
 
 def _fits(runners: Mapping[str, Runner], source: str, end: int) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..config.findings import ValueOrigin
+from ..config.group_section import group_name
 from ..config.loading import LoadedConfig
 from ..rings.library import library_missed, why_no_library
 from ..run.one_process import apart, claims_in
@@ -236,11 +237,14 @@ def _groups(plan: Plan) -> list[str]:
     config, instances = plan.system.config, plan.system.instances
     edges = [(c.source_instance, c.target_instance) for c in plan.connections if not c.initial_only]
     automatic = automatic_nodes(config, edges, claims_in(plan))
-    lines = []
+    lines = [
+        f"  '{own.name}' is solved at each point: {listed([str(unknown) for unknown in own.unknowns])}"
+        for own in plan.groups
+    ]
     for cycle in plan.cycles:
         names = ", ".join(sorted(cycle, key=[*instances].index))
         now = {plan.node_of(name) for name in cycle}
-        would = {automatic.get(name, config.instances[name].group or name) for name in cycle}
+        would = {automatic.get(name, group_name(config.instances[name].group) or name) for name in cycle}
         if len(now) > 1:
             cost = f"{names} form a cycle over {len(now)} nodes: each point costs a round trip"
             lines.append(f"  {cost}; {_remedy(len(now), len(would))}")

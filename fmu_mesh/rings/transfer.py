@@ -53,7 +53,7 @@ class Transfer:
         target_points: int,
         text: bool | None = None,
     ) -> None:
-        self.feed = feed
+        self.feed, self.target = feed, target
         self.source = source
         self.rule = CouplingRule(feed.delay, source_points, target_points)
         self.columns = [

@@ -1,4 +1,4 @@
-"""How the outputs of all instances depend directly on their connected inputs, for `loops: solved`.
+"""How outputs depend directly on connected inputs: of all instances for `loops: solved`, and within solved groups.
 
 What the user says (`feedthrough`) counts, else what is measured; where neither says it, a cycle cannot be solved.
 """
@@ -20,6 +20,7 @@ from ..config.instance_sections import InstanceSection, key_of, placed
 from ..instances.feedthrough import Measured, measured
 from ..system.consistent_outputs import element_pairs
 from ..system.graph import is_cycle, strongly_connected
+from ..system.solved_groups import blocks_of, is_solved
 from ..system.system import ResolvedSystem
 from ..text import listed, nearest
 from ..variables.model_description import Causality
@@ -43,18 +44,19 @@ class _Question(NamedTuple):
 def with_feedthrough(
     system: ResolvedSystem, sections: Mapping[str, InstanceSection], findings: Findings, warnings: Findings
 ) -> ResolvedSystem:
-    """The system with the derivatives of outputs by inputs, if loops are solved; warns where one is not known.
+    """The system with the derivatives of outputs by inputs, if they are needed; warns where one is not known.
 
     Raises:
         ConfigurationError: a cycle needs one that is not known, or one that is given has a wrong name. It has the
             ``findings``.
     """
-    if system.config.simulation.loops == "delayed":
+    if system.config.simulation.loops == "delayed" and not blocks_of(system.config.members):
         return system
     questions = _questions(system)
     with ThreadPoolExecutor(_AT_ONCE) as threads:
         answers = threads.map(lambda name: _answer(system, sections, name, questions[name], findings), questions)
         known = dict(zip(questions, answers, strict=True))
+    blocks = blocks_of(system.config.members)
     edges = [(c.source_instance, c.target_instance) for c in system.connections if not c.initial_only]
     cycles = [part for part in strongly_connected(system.instances, edges) if is_cycle(part, edges)]
     for name, answer in known.items():
@@ -63,6 +65,10 @@ def with_feedthrough(
             continue
         asked, cycle = questions[name], next((part for part in cycles if name in part), None)
         what = f"how {listed(asked.outputs)} depends directly on {listed(asked.inputs)} is not known: {why}"
+        if name in blocks:
+            expected = f"`feedthrough: {{{asked.outputs[0]}: {{{asked.inputs[0]}: ...}}}}` there, or no `solve`"
+            findings.add(f"instances.{name}.feedthrough", f"a group that is solved, but {what}", expected)
+            continue
         if cycle is None:
             warnings.add(f"instances.{name}.feedthrough", f"{what}. It is not made consistent", "")
             continue
@@ -76,13 +82,19 @@ def with_feedthrough(
 def _questions(system: ResolvedSystem) -> dict[str, _Question]:
     inputs: dict[str, dict[str, None]] = {}
     outputs: dict[str, dict[str, None]] = {}
-    instances = system.instances
+    instances, blocks, everywhere = (
+        system.instances,
+        blocks_of(system.config.members),
+        system.config.simulation.loops == "solved",
+    )
     for c in system.connections:
         same = instances[c.source_instance].step_points == instances[c.target_instance].step_points
+        held = is_solved(c, blocks) and c.extrapolation != "linear"  # with a line, outputs belong to its end
+        asks = held if c.target_instance in blocks else everywhere and same
         if not c.initial_only and c.source.type == c.target.type == "Float64" and not c.map:
             for source, target in element_pairs(c):
                 outputs.setdefault(c.source_instance, {})[source] = None
-                if same:
+                if asks:
                     inputs.setdefault(c.target_instance, {})[target] = None
     for name, variable in system.recorded:
         outputs.setdefault(name, {})[variable] = None

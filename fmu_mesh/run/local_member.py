@@ -56,6 +56,7 @@ class LocalMember:
         self._looks_at_rows = True
         self._points = self.plan.step_points
         self._feeds: list[_Feed] = []
+        self._timed: list[LocalMember] = []  # those that get values over time before its step
         self._courses: dict[str, Course] = {}
         self._last = LastValues((), {}, instance.description)
         self._parameters: dict[str, str] = {}
@@ -139,6 +140,7 @@ class LocalMember:
         self.instance.bind(self._inputs, (self._outputs,), grid, self.plan.step_points, self.step)
         self._looks_at_rows = not self.instance.check_rows(self.is_finite.spans)
         self._do_step = self.instance.do_step
+        self._timed = [self] if self._courses or self.plan.timeouts else []
         self._setters.clear()
         self._feeds.clear()
         for c in self.connections:
@@ -179,11 +181,8 @@ class LocalMember:
             return
         step = self.step
         start = step * self._points
-        if self._courses or self.plan.timeouts:
-            changes = {name: course.change(step) for name, course in self._courses.items()}
-            prescribed = {name: value for name, value in changes.items() if value is not None}
-            if prescribed := prescribed | self._last.fall_back(step):
-                self._give(prescribed)
+        for member in self._timed:
+            member.prescribe(step)
         for read, points, lead, change, write in self._feeds:
             value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
             write(0, value if change is None else change(value))
@@ -197,6 +196,24 @@ class LocalMember:
             self.is_finite.explain(error)
             self.instance.hold(step, error)
         self.step = step + 1
+
+    def solve_with(self, others: Sequence[LocalMember]) -> None:
+        """Take the steps of a solved group, of which it is the first member: it needs what all of them read."""
+        for other in others:
+            other.follow_first(self._feeds, self._timed)
+
+    def follow_first(self, feeds: list[_Feed], timed: list[LocalMember]) -> None:
+        """The first member of its solved group, which has these feeds, takes its steps."""
+        feeds += self._feeds
+        timed += self._timed
+        self._feeds, self._timed = [], []
+
+    def prescribe(self, step: int) -> None:
+        """Give own step ``step`` what the scenario prescribes, and what inputs without a value fall back to."""
+        changes = {name: course.change(step) for name, course in self._courses.items()}
+        prescribed = {name: value for name, value in changes.items() if value is not None}
+        if prescribed := prescribed | self._last.fall_back(step):
+            self._give(prescribed)
 
     def getter(self, name: str) -> Callable[[int], Value]:
         """See `LocalSystem.getter`: from the row of the point, or from the model if something was set since then."""

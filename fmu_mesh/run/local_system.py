@@ -22,6 +22,7 @@ from ..instances.call_guard import Guarded, doing
 from ..instances.contract import LogMessage, Opening, Showing
 from ..instances.kept_models import KeptModels
 from ..instances.process_state import LOOK_STEPS, kept_state
+from ..instances.tight_group import solve_together
 from ..printing import paragraph
 from ..rings.value_change import ValueChange
 from ..system.algebraic_loop import FixedPoint
@@ -100,6 +101,7 @@ class LocalSystem:
                 members[name] = before.get(name) or LocalMember(plan, name, open_instance(name))
                 self._members = before | members
             self._members = members
+            solve_together(plan.groups, {name: member.instance for name, member in members.items()})
             self._limit_threads()  # with the libraries that a component has imported
             begins = begins_with or BeginsWith()
             self._initialize(start_values, begins, point)
@@ -277,6 +279,9 @@ class LocalSystem:
         for member in members.values():
             member.instance.exit_initialization()
             member.bind(grid, members)
+        for group in self._plan.groups:
+            first, *others = (members[name] for name in group.members)
+            first.solve_with(others)
 
     def _iterate(self, loop: Loop, known: dict[tuple[str, str], Value]) -> None:
         """Iterate an algebraic loop until its values are consistent."""

@@ -351,6 +351,7 @@ def opening_in(
         timeouts=node.timeouts,
         linear_inputs=item.linear_inputs,
         midpoint_inputs=item.midpoint_inputs,
+        group=next((group for group in node.groups if name in group.members), None),
         log=log,
     )
 

@@ -10,14 +10,14 @@ So all of them are the solution of one linear system. It is solved here once, wi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 from ..config.findings import Findings
 from ..text import listed
 from .connections import Connection
 from .coupling_rule import Consistent, Term
 
-__all__ = ["Feedthrough", "consistent_outputs", "element_pairs"]
+__all__ = ["Feedthrough", "consistent_outputs", "element_pairs", "solve"]
 
 Feedthrough = Mapping[str, Mapping[str, Mapping[str, float]]]
 """By instance, output and input: the derivative of the output by the input at the same point."""
@@ -26,6 +26,8 @@ Output = tuple[str, str]
 Column = tuple[str, str]
 
 _SINGULAR: Final = 1e-12
+
+Key = TypeVar("Key")
 
 
 def element_pairs(connection: Connection) -> Iterator[tuple[str, str]]:
@@ -73,7 +75,7 @@ def consistent_outputs(
             else:
                 _add(right, before, value * c.factor)
         known.append(right)
-    if (loop := _solve(matrix, known)) is not None:
+    if (loop := solve(matrix, known)) is not None:
         names = listed([".".join(unknown[number]) for number in loop])
         found = f"solved, and the values of {names} do not follow from each other: their loop has the gain 1"
         findings.add("simulation.loops", found, "delayed, or a system without this loop")
@@ -81,7 +83,7 @@ def consistent_outputs(
     return {output: _formula(right) for output, right in zip(unknown, known, strict=True)}
 
 
-def _add(sums: dict[Column | None, float], column: Column | None, value: float) -> None:
+def _add(sums: dict[Key, float], column: Key, value: float) -> None:
     sums[column] = sums.get(column, 0.0) + value
 
 
@@ -90,9 +92,10 @@ def _formula(sums: Mapping[Column | None, float]) -> Consistent:
     return Consistent(sums.get(None, 0.0), tuple(Term(*column, sums[column]) for column in columns))
 
 
-def _solve(matrix: list[list[float]], right: list[dict[Column | None, float]]) -> list[int] | None:
+def solve(matrix: list[list[float]], right: list[dict[Key, float]]) -> list[int] | None:
     """Bring the matrix to the identity by the steps of Gauss and Jordan, and do the same with the right sides.
 
+    Both in place; then each right side is that of the variable with its number.
     Returns the numbers of the rows that are left if there is no solution.
     """
     left = [*range(len(matrix))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -12,6 +12,7 @@ from .connections import Connection
 from .coupling_rule import Consistent
 from .feeds import consistent_columns
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
+from .solved_groups import Blocks, within_block
 
 __all__ = ["ExecutionOrder", "execution_order"]
 
@@ -25,49 +26,63 @@ class ExecutionOrder(NamedTuple):
     cycles: tuple[tuple[str, ...], ...]
 
 
-def execution_order(
+def execution_order(  # noqa: PLR0913, PLR0917  what the order follows from
     names: Collection[str],
     connections: Sequence[Connection],
     algorithm: str,
     findings: Findings,
+    blocks: Blocks,
     consistent: Mapping[tuple[str, str], Consistent] | None = None,
 ) -> ExecutionOrder:
     """The connections between instances with their delays, the order of the instances, and the cycles.
 
-    If outputs are made ``consistent`` (`loops: solved`), all connections of a cycle have a delay of 1.
+    If outputs are made ``consistent`` (`loops: solved`), all connections of a cycle have a delay of 1. So have those
+    within a solved group, whose members follow one another; to all others such a group is one instance.
 
     Raises:
         ConfigurationError: there is one; has all findings.
     """
+    vertices = [name for name in names if blocks.get(name, name) == name]
+    connections = [replace(c, delay=1) if within_block(c, blocks) else c for c in connections]
     if consistent is not None:
-        connections = _delayed_within(names, connections, findings)
-    connections, closing = _with_delays(names, connections, algorithm)
-    instant = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
-    loops = [loop for loop in strongly_connected(names, instant) if is_cycle(loop, instant)]
+        connections = _delayed_within(vertices, connections, blocks, findings)
+    connections, closing = _with_delays(vertices, connections, algorithm, blocks)
+    instant = _edges((c for c in connections if c.delay == 0), blocks)
+    loops = [loop for loop in strongly_connected(vertices, instant) if is_cycle(loop, instant)]
     for loop in loops:
-        _add_algebraic_loop(loop, connections, findings)
+        _add_algebraic_loop(loop, connections, blocks, findings)
     if loops:
         findings.raise_any()
-    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
+    edges = _edges((c for c in connections if not c.initial_only and not within_block(c, blocks)), blocks)
     for c in connections if consistent else ():
         if c.delay == 0:
-            instant += [(source, c.target_instance) for source, _, _ in consistent_columns(c, consistent or {})]
-    order = topological_order(names, instant)
-    cycles = tuple(tuple(part) for part in strongly_connected(names, edges) if is_cycle(part, edges))
-    return ExecutionOrder(connections, closing, tuple(order), cycles)
+            columns = consistent_columns(c, consistent or {})
+            target = blocks.get(c.target_instance, c.target_instance)
+            instant += [(blocks.get(source, source), target) for source, _, _ in columns]
+    of = {vertex: [name for name in names if blocks.get(name, name) == vertex] for vertex in vertices}
+    order = tuple(name for vertex in topological_order(vertices, instant) for name in of[vertex])
+    parts = [part for part in strongly_connected(vertices, edges) if is_cycle(part, edges)]
+    cycles = tuple(tuple(name for vertex in part for name in of[vertex]) for part in parts)
+    return ExecutionOrder(tuple(connections), closing, order, cycles)
+
+
+def _edges(connections: Iterable[Connection], blocks: Blocks) -> list[tuple[str, str]]:
+    ends = ((c.source_instance, c.target_instance) for c in connections)
+    return [(blocks.get(source, source), blocks.get(target, target)) for source, target in ends]
 
 
 def _delayed_within(
-    names: Collection[str], connections: Sequence[Connection], findings: Findings
+    vertices: Collection[str], connections: Sequence[Connection], blocks: Blocks, findings: Findings
 ) -> tuple[Connection, ...]:
     """The connections with a delay of 1 for those within a cycle; a finding for each of them that has another one."""
-    edges = [(c.source_instance, c.target_instance) for c in connections if not c.initial_only]
-    parts = [part for part in strongly_connected(names, edges) if is_cycle(part, edges)]
+    edges = _edges((c for c in connections if not c.initial_only and not within_block(c, blocks)), blocks)
+    parts = [part for part in strongly_connected(vertices, edges) if is_cycle(part, edges)]
     of = {name: number for number, part in enumerate(parts) for name in part}
     found = []
     for c in connections:
-        number = of.get(c.source_instance)
-        within = number is not None and number == of.get(c.target_instance) and not c.initial_only
+        source, target = _edges([c], blocks)[0]
+        number = of.get(source)
+        within = number is not None and number == of.get(target) and not c.initial_only
         if within and c.delay == 0:
             findings.add(f"{c.path}.delay", f"0 for {c}, within a cycle whose loops are solved", "1, or no `delay`")
         found.append(replace(c, delay=1) if within else c)
@@ -75,7 +90,7 @@ def _delayed_within(
 
 
 def _with_delays(
-    names: Collection[str], given: Sequence[Connection], algorithm: str
+    vertices: Collection[str], given: Sequence[Connection], algorithm: str, blocks: Blocks
 ) -> tuple[tuple[Connection, ...], tuple[Connection, ...]]:
     """All connections with a delay of 0 or 1, and those that got 1 because they close a cycle.
 
@@ -84,8 +99,8 @@ def _with_delays(
     if algorithm == "jacobi":
         return tuple(replace(c, delay=1) if c.delay is None and not c.initial_only else c for c in given), ()
     free = [c for c in given if c.delay != 1 and not c.initial_only]
-    edges = [(c.source_instance, c.target_instance, c.delay is None) for c in free]
-    closing = {id(free[index]) for index in feedback_edges(names, edges)}
+    edges = [(*ends, c.delay is None) for ends, c in zip(_edges(free, blocks), free, strict=True)]
+    closing = {id(free[index]) for index in feedback_edges(vertices, edges)}
     connections = []
     for connection in given:
         delay = connection.delay
@@ -96,13 +111,12 @@ def _with_delays(
     return tuple(connections), chosen
 
 
-def _add_algebraic_loop(loop: list[str], connections: tuple[Connection, ...], findings: Findings) -> None:
+def _add_algebraic_loop(loop: list[str], connections: Sequence[Connection], blocks: Blocks, findings: Findings) -> None:
     """Add a finding for a cycle on which every connection has delay 0."""
-    edges = [(c.source_instance, c.target_instance) for c in connections if c.delay == 0]
+    instant = [c for c in connections if c.delay == 0]
+    edges = _edges(instant, blocks)
     walk = cycle_through(loop, edges)
-    first = next(
-        c for c in connections if c.delay == 0 and (c.source_instance, c.target_instance) == (walk[0], walk[1])
-    )
+    first = instant[edges.index((walk[0], walk[1]))]
     found = f"an algebraic loop: every connection on the cycle {' -> '.join(walk)} has delay 0"
     expected = "at least one connection with delay 1 (set `delay: 1`, or leave the delays to the algorithm)"
     findings.add(first.path, found, expected)

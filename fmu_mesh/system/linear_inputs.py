@@ -16,6 +16,7 @@ from ..config.mesh import Config
 from ..text import counted
 from ..variables.model_description import ModelDescription
 from .connections import Connection
+from .solved_groups import blocks_of, is_solved
 
 __all__ = ["LinearInput", "counted_ways", "with_extrapolation"]
 
@@ -43,15 +44,20 @@ def with_extrapolation(
 ) -> tuple[Connection, ...]:
     """The connections with their ways of extrapolation; a finding for every way that a target does not support.
 
+    Within a solved group it is `linear` where the target takes that: its line ends at the value that is solved.
+
     What is said for an instance or for all holds for the inputs that can change within a step.
     """
-    found = []
+    found, blocks = [], blocks_of(config.members)
     for c in connections:
         own, target = c.extrapolation, config.instances[c.target_instance]
         general, place = target.extrapolation, f"instances.{c.target_instance}.extrapolation"
         if general is None:
             general, place = config.simulation.extrapolation, "simulation.extrapolation"
-        wanted: Extrapolation = own or general
+        solved = is_solved(c, blocks)
+        if solved and own is not None:
+            findings.add(f"{c.path}.extrapolation", f"{own} for {c}, within a group that is solved", "none")
+        wanted: Extrapolation = "auto" if solved else own or general
         description = descriptions[c.target_instance]
         why_held, why_not_linear = _why_held(c), _why_not_linear(c, description, retries=target.retries_steps)
         way: Extrapolation = wanted

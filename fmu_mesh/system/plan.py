@@ -37,6 +37,7 @@ from .node_links import Link, links_of
 from .played_nodes import keeps_states, played_nodes
 from .records import RecordPlan
 from .schedule import Schedule, row_of
+from .solved_groups import SolvedGroup, blocks_of, solved_groups
 from .start_values import why_not_settable
 from .system import Connection, ResolvedSystem, SystemInstance
 from .window import recorder_window, rows_of_ring, window_of
@@ -123,6 +124,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         batch: number of points that it may sleep for at once; 1 if others may wait for its own next row.
         memory: where everything lies in the memory that processes of one host share.
         rings: the output rings of its instances, and of all instances that it has values from.
+        groups: the solved groups of its instances: each is one unit.
         loops: the algebraic loops at the start with instances of this node; ``initialization``: how they are iterated.
         shared_memory: whether processes of one host exchange messages through shared memory.
         row_streams: whether processes that share no memory exchange rows through sockets of their own.
@@ -147,6 +149,7 @@ class NodePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     units: tuple[tuple[str, ...], ...]
     links_in: tuple[Link, ...]
     links_out: tuple[Link, ...]
+    groups: tuple[SolvedGroup, ...] = ()
     loops: tuple[Loop, ...] = ()
     initialization: InitializationConfig = InitializationConfig()
     records: tuple[RecordPlan, ...] = ()
@@ -193,6 +196,7 @@ class Plan(msgspec.Struct, frozen=True):
         cycles: instance names of every cycle.
         closing: the connections that have a delay of 1 because they close a cycle.
         consistent: the formula of each output that is made consistent, by instance and name of the output or element.
+        groups: the groups that are solved.
         nodes: by node name, with the recorder if there is one.
         played: the nodes whose rows are kept for a restart, because others have no state.
     """
@@ -203,6 +207,7 @@ class Plan(msgspec.Struct, frozen=True):
     cycles: tuple[tuple[str, ...], ...]
     closing: tuple[Connection, ...]
     consistent: dict[tuple[str, str], Consistent]
+    groups: tuple[SolvedGroup, ...]
     initialization: InitializationPlan
     window: int
     digest: str
@@ -247,9 +252,13 @@ def make_plan(
     findings = Findings(system.config.mesh) if findings is None else findings
     names, how = [*system.instances], system.config.simulation.algorithm
     points = {name: own.step_points for name, own in system.instances.items()}
-    consistent = consistent_outputs(system.connections, system.feedthrough, points, findings)
+    blocks = blocks_of(system.config.members)  # their outputs are consistent as they are
+    direct = {name: own for name, own in system.feedthrough.items() if name not in blocks}
+    consistent = consistent_outputs(system.connections, direct, points, findings)
     solved = consistent if system.config.simulation.loops == "solved" else None
-    connections, closing, order, cycles = execution_order(names, system.connections, how, findings, solved)
+    made = execution_order(names, system.connections, how, findings, blocks, solved)
+    connections, closing, order, cycles = made
+    groups = solved_groups(system.config.members, connections, order, system.feedthrough)
     compares = system.config.simulation.defects and system.records  # it is done where rows are written
     system = replace(
         system,
@@ -262,7 +271,7 @@ def make_plan(
     outputs = system.output_layouts(read[:2] for read in reads)
     window = window_of(system.config.simulation.window if window is None else window, outputs.values())
     played = played_nodes(system, outputs).names if keeps_states(system.config.recovery) else ()
-    plan = Plan(system, connections, order, cycles, closing, consistent, initialization, window, "", {}, played)
+    plan = Plan(system, connections, order, cycles, closing, consistent, groups, initialization, window, "", {}, played)
     kept = {name: own.names for name, own in outputs.items() if system.instances[name].node in played}
     nodes = _nodes(plan, outputs, links_of(system, reads, initialization, kept))
     digest = _digest(system, nodes, contents)
@@ -337,6 +346,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> 
             units=tuple(dict.fromkeys(within[name] for name in members)),
             links_in=links_in,
             links_out=tuple(link for link in links if link.source_node == node),
+            groups=tuple(group for group in plan.groups if group.members[0] in members),
             loops=tuple(loop for loop in plan.initialization.loops if node in loop.nodes),
             initialization=config.initialization,
             records=system.records if node == RECORDER else (),
@@ -352,12 +362,13 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> 
 
 
 def _units(plan: Plan, node: str, members: list[str]) -> dict[str, tuple[str, ...]]:
-    """The unit of each member of a node: its cycle if all of it is in this node, otherwise the member alone.
+    """The unit of each member of a node: its cycle if all of it is in this node, its solved group, or itself alone.
 
     A cycle over several nodes is stepped member by member, because a member may wait for another node that waits for a
     member of this node.
     """
     units: dict[str, tuple[str, ...]] = {name: (name,) for name in members}
+    units |= {name: group.members for group in plan.groups for name in group.members if name in units}
     for cycle in plan.cycles:
         if all(plan.node_of(name) == node for name in cycle):
             unit = tuple(name for name in plan.order if name in cycle)

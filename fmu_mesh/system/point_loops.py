@@ -14,6 +14,7 @@ from ..config.findings import Findings
 from ..text import listed
 from .graph import cycle_through, strongly_connected
 from .plan import Plan
+from .solved_groups import blocks_of, is_solved
 from .system import Connection
 
 __all__ = ["warn_of_point_loops"]
@@ -27,8 +28,10 @@ Edges = dict[tuple[Vertex, Vertex], Connection | None]
 
 def warn_of_point_loops(plan: Plan, findings: Findings) -> None:
     """Add a warning for each loop at every point, and one for outputs that may close one; none if they are solved."""
+    blocks = blocks_of(plan.system.config.members)
     is_delayed = plan.system.config.simulation.loops == "delayed"
-    declared, assumed = _edges(plan.connections) if plan.cycles and is_delayed else ({}, {})
+    delayed = [c for c in plan.connections if not is_solved(c, blocks)]
+    declared, assumed = _edges(delayed) if plan.cycles and is_delayed else ({}, {})
     for loop, inside in _loops(declared):
         walk, more = _walk(loop, inside)
         found = (

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
+from ..config.group_section import group_name
 from ..config.mesh import Config
 from .graph import strongly_connected
 
@@ -69,7 +70,8 @@ def automatic_nodes(config: Config, edges: Iterable[tuple[str, str]], claims: Cl
     share a node, nor do two that cannot share a process. The edges are those of all connections between instances.
     """
     position = {name: place for place, name in enumerate(config.instances)}
-    taken = {*config.instances, *(instance.group for instance in config.instances.values() if instance.group)}
+    groups = (group_name(instance.group) for instance in config.instances.values())
+    taken = {*config.instances, *(group for group in groups if group is not None)}
     nodes: dict[str, str] = {}
     cycles = [sorted(part, key=position.__getitem__) for part in strongly_connected(config.instances, edges)]
     for cycle in sorted(cycles, key=lambda members: position[members[0]]):

@@ -87,6 +87,8 @@ def saved_instances(
             "values over time": _hash([schedule.agreed() for schedule in own.scenario]),
             "timeouts": _hash(own.timeouts),
         }
+        if groups := [group for group in plan.groups if name in group.members]:
+            agreed["group"] = _hash(groups)
         if plan.consistent:
             agreed["consistent outputs"] = _hash(plan.nodes[own.node].instance(name).step_feeds)
         agreed |= {

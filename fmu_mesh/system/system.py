@@ -19,6 +19,7 @@ from fmu_mesh import files
 from fmu_mesh.config.access_sections import check_access
 from fmu_mesh.config.deploy_section import check_deploy
 from fmu_mesh.config.findings import Findings
+from fmu_mesh.config.group_section import group_name
 from fmu_mesh.config.instance_sections import InstanceSection, key_of
 from fmu_mesh.config.key_sections import KEY, KeyView
 from fmu_mesh.config.loading import LoadedConfig
@@ -38,6 +39,7 @@ from fmu_mesh.system.process_sharing import ClaimsOf, SharedProcess, automatic_n
 from fmu_mesh.system.records import CheckRecord, RecordPlan, record_warnings, resolve_records, union_of
 from fmu_mesh.system.scenario import ResolvedScenario, Scenario, ScenarioInput, resolve_scenario
 from fmu_mesh.system.schedule import Schedule
+from fmu_mesh.system.solved_groups import blocks_of, check_solved_groups
 from fmu_mesh.system.start_values import check_substitutes, forbidden_start_values, resolve_start_values, sized
 from fmu_mesh.text import listed, nearest, nearest_file, shown
 from fmu_mesh.variables.model_description import ModelDescription, Value
@@ -181,6 +183,7 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     connections = resolve_connections(config.connections, variables, collected)
     connections += coupled_connections(config.engines, variables, connections, collected)
     connections = with_extrapolation(config, connections, descriptions, collected)
+    check_solved_groups(config.members, descriptions, connections, collected)
     if obstacles is not None:
         obstacles.explain(collected.places)
     of_files = collected if obstacles is None else obstacles
@@ -190,9 +193,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     keys_in, keys_out = resolve_keys(config.connections, root, step_size, variables, connected, unit_of, collected)
     sources = sources_of(config.connections) | connected  # also those of wrong connections
     fed = {name for name, source in sources.items() if not source.startswith(KEY)}
-    base = grid.step_size if grid is not None else 1.0
     timeouts = {
-        name: tuple(_timeouts(own, config, fed, base, collected))
+        name: tuple(_timeouts(own, config, fed, grid.step_size if grid else 1.0, collected))
         for name, own in instances.items()
         if config.instances[name].inputs
     }
@@ -201,7 +203,8 @@ def build(  # noqa: PLR0913, PLR0917  a configuration, and what was found about 
     doors = _check_zenoh(loaded, collected)
     if len(collected):
         collected.merge(obstacles or ())
-        execution_order([*instances], connections, config.simulation.algorithm, collected)  # for its findings
+        how, blocks = config.simulation.algorithm, blocks_of(config.members)
+        execution_order([*instances], connections, how, collected, blocks)  # for its findings
     if grid is None or len(instances) < len(config.instances):
         collected.raise_any()
         missing = [name for name in config.instances if name not in descriptions]
@@ -313,7 +316,7 @@ def _instances(
             description=descriptions[name],
             start_values=start_values,
             step_points=step_points,
-            node=config.group or name,
+            node=group_name(config.group) or name,
             not_finite=not_finite,
         )
     return instances
@@ -380,14 +383,14 @@ def _check_nodes(
     first_with_code: dict[str, str] = {}
     processes: dict[str, SharedProcess] = {}
     for name, instance in config.instances.items():
-        group = instance.group
+        group = group_name(instance.group)
         if group is None:
             continue
         path = f"instances.{name}.group"
         first = first_of.setdefault(group, name)
         if group == _RESERVED_NAME:
             findings.add(path, f"the group '{group}'", "another name: it is reserved for the mesh itself")
-        elif group in config.instances and config.instances[group].group != group:
+        elif group in config.instances and group_name(config.instances[group].group) != group:
             found = f"the group '{group}', which is the name of an instance outside the group"
             findings.add(path, found, "a name of its own")
         with_code = first_with_code.setdefault(group, name) if instance.names_code else name

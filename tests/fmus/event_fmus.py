@@ -153,6 +153,21 @@ MODELS = {
         ),
         integers=(Var("on", "fixed", 1), Var("switches", output=True), Var("completed_steps")),
     ),
+    "LinearPart": Model(
+        states=2,
+        indicators=(),
+        reals=(
+            Var("x", "fixed", 0.0, output=True),
+            Var("v", "fixed", 0.0, output=True),
+            Var("der(x)", derivative="x"),
+            Var("der(v)", derivative="v"),
+            Var("y", output=True),
+            *(Var(name, "fixed", 0.0) for name in ("a", "b", "e", "c", "d", "f")),
+            Var("u", "continuous", 0.0),
+            Var("w", "continuous", 0.0),
+        ),
+        integers=(Var("masses", "fixed", 0), Var("stays", "fixed", 0)),
+    ),
     "Rotor": Model(
         states=1,
         indicators=(),

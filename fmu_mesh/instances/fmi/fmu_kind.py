@@ -281,7 +281,7 @@ class FmuKind(Kind[FmuConfig]):
         )
         path, folder, terms = opening.path, opening.folder, Terms(opening.limits, section.sha256, opening.content)
         instance = open_instance(path, opening.name, description, folder, opening.log, terms, options, opening.kept)
-        return stepped(instance, options)
+        return stepped(instance, options) if opening.group is None else instance
 
 
 KIND_OF_FMUS = FmuKind()  # what the entry point `fmu` names

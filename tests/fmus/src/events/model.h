@@ -56,6 +56,7 @@ Update model_event(Model *m);                    /* one event iteration */
 bool model_completed_step(Model *m);             /* whether a step event happened */
 bool model_discards(const Model *m, double step_size);
 bool model_refuses(const Model *m);              /* whether the derivatives cannot be computed here */
+bool model_refuses_state(const Model *m);        /* whether it cannot go back to a state (FMI 2.0); most can */
 
 /* Advances by at most `step_size`, to `*reached`: to the end, or to an event that the importer shall handle. Without
  * `stop_at_events` all events are handled inside. */
