@@ -21,7 +21,7 @@ LOCAL = pytest.mark.parametrize("options", [(), ("--local",)], ids=["distributed
 PACED = {"real_time_factor": 1.0, "step_size": 0.01}
 FIELDS = {
     "mesh", "state", "exit_code", "point", "time", "seconds", "rows", "file", "restarts", "resets", "error", "ended_by",
-    "files", "warnings",
+    "files", "warnings", "defects",
 }  # fmt: skip
 
 
@@ -56,6 +56,7 @@ def test_a_launch_for_programs_prints_its_outcome_and_nothing_else(place: Place,
         "ended_by": None,
         "files": [{"file": str(place.folder / "pair.csv"), "rows": 1001}],
         "warnings": [],
+        "defects": {},
     }
 
 
