@@ -11,7 +11,15 @@ from msgspec import Meta
 from fmu_mesh.config.base import POSITIVE, Base, Name
 from fmu_mesh.config.findings import Findings
 
-__all__ = ["Group", "GroupConfig", "Member", "StepControlConfig", "group_name", "solved_groups_of"]
+__all__ = [
+    "Group",
+    "GroupConfig",
+    "GroupedInstance",
+    "Members",
+    "StepControlConfig",
+    "group_name",
+    "solved_groups_of",
+]
 
 
 class StepControlConfig(Base, frozen=True, kw_only=True):
@@ -57,7 +65,7 @@ Group = Annotated[
 ]
 
 
-class Member(NamedTuple):
+class GroupedInstance(NamedTuple):
     """What of an instance matters to its group: the key, its step size in s, and whether a failure does not end it."""
 
     group: str | GroupConfig | None
@@ -65,12 +73,18 @@ class Member(NamedTuple):
     holds: bool
 
 
+Members = Mapping[str, GroupedInstance]
+"""All instances by name, whatever their groups."""
+
+
 def group_name(group: str | GroupConfig | None) -> str | None:
     """The name of the group that an instance has."""
     return group.name if isinstance(group, GroupConfig) else group
 
 
-def solved_groups_of(members: Mapping[str, Member], findings: Findings | None = None) -> dict[str, GroupConfig]:
+def solved_groups_of(
+    members: Mapping[str, GroupedInstance], findings: Findings | None = None
+) -> dict[str, GroupConfig]:
     """The groups that are solved, by name; a finding for each member that says something else than one before it."""
     found: dict[str, tuple[str, GroupConfig]] = {}
     for name, member in members.items():

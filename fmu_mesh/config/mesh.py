@@ -17,7 +17,7 @@ from msgspec import Meta
 from fmu_mesh.config.access_sections import RuntimeConfig, SecurityConfig, ZenohConfig
 from fmu_mesh.config.base import Base, DeadlineSeconds, Name
 from fmu_mesh.config.deploy_section import DeployConfig
-from fmu_mesh.config.group_section import Member
+from fmu_mesh.config.group_section import GroupedInstance
 from fmu_mesh.config.instance_sections import (
     EXTRAPOLATIONS,
     KIND,
@@ -341,11 +341,11 @@ class Config(Base, frozen=True, kw_only=True):
         return tuple(dict.fromkeys(keyed))
 
     @property
-    def members(self) -> dict[str, Member]:
+    def members(self) -> dict[str, GroupedInstance]:
         """What of each instance matters to its group, by name."""
         base = self.simulation.step_size
         return {
-            name: Member(own.group, own.step_size or base, own.on_failure != "stop")
+            name: GroupedInstance(own.group, own.step_size or base, own.on_failure != "stop")
             for name, own in self.instances.items()
         }
 

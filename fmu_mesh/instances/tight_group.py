@@ -33,7 +33,7 @@ from ..system.solved_groups import SolvedGroup
 from ..text import counted, listed
 from .contract import Instance
 from .instance_wrapper import AroundInstance
-from .tight_member import GroupState, Span, TightMember
+from .tight_member import GroupState, GroupStep, TightMember
 
 __all__ = ["solve_together"]
 
@@ -77,7 +77,7 @@ class _TightGroup:
         self._most = _FINEST if plan.step_tolerance is not None else 0
         self._left: list[tuple[float, float]] = []  # what the last try has left of each unknown, and its value
         self._points = self._steps = self._tries = 0
-        self._members[0].lead(self.step, self._cost)
+        self._members[0].lead(self)
 
     @property
     def _known(self) -> GroupState:
@@ -86,7 +86,9 @@ class _TightGroup:
     def _note(self, **changes: Any) -> None:  # noqa: ANN401  fields of the state
         self._members[0].note(replace(self._known, **changes))
 
-    def _cost(self) -> str:
+    @property
+    def cost(self) -> str:
+        """How many steps and tries there were, in words."""
         points, group = counted(self._points, "point"), self._plan.name
         return f"the group '{group}' took {counted(self._steps, 'step')} and {self._tries} tries for {points}"
 
@@ -106,7 +108,8 @@ class _TightGroup:
             if level != bound:
                 self._refine(level, number)
                 bound = level
-            if self._try(Span(number, math.ldexp(size, -level), place / whole, (place + part) / whole), starts, level):
+            span = GroupStep(number, math.ldexp(size, -level), place / whole, (place + part) / whole)
+            if self._try(span, starts, level):
                 place += part
                 starts = self._given()
                 self._steps += 1
@@ -120,7 +123,7 @@ class _TightGroup:
         for member in self._members:
             member.refine(level, number)
 
-    def _try(self, span: Span, starts: Sequence[float], level: int) -> bool:
+    def _try(self, span: GroupStep, starts: Sequence[float], level: int) -> bool:
         """Take one step, and choose the size of the next one; whether it was good. If not, all are where they were."""
         with self._kept() as states:
             ends = self._solved(span, starts, states)
@@ -145,7 +148,7 @@ class _TightGroup:
         """What the connections give of the outputs, for each unknown."""
         return [cast("float", scaled(one.value(output), *change)) for one, output, *change in self._sources]
 
-    def _solved(self, span: Span, starts: Sequence[float], states: Sequence[object]) -> list[float] | None:
+    def _solved(self, span: GroupStep, starts: Sequence[float], states: Sequence[object]) -> list[float] | None:
         """The unknowns at the end of a step; None if the tries do not find them."""
         slopes, before, was_measured = self._known.slopes, math.inf, False
         ends = [start + slope * span.size for start, slope in zip(starts, slopes or [0.0] * len(starts), strict=True)]
@@ -174,7 +177,7 @@ class _TightGroup:
 
     def _measure(
         self,
-        span: Span,
+        span: GroupStep,
         starts: Sequence[float],
         ends: Sequence[float],
         given: Sequence[float],
@@ -200,7 +203,7 @@ class _TightGroup:
             raise StepFailed(text, instance=self._targets[loop[0]].name, hint=_WAYS_OUT)
         self._note(inverse=tuple(tuple(own.get(n, 0.0) for n in count) for own in right))
 
-    def _is_good(self, span: Span, starts: Sequence[float], ends: Sequence[float], level: int) -> bool:
+    def _is_good(self, span: GroupStep, starts: Sequence[float], ends: Sequence[float], level: int) -> bool:
         """Whether the lines are near enough to the courses of the unknowns, as far as their ends tell.
 
         The end of a step and the slope before it give the second derivative, and that the distance in the middle. What

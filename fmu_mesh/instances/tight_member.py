@@ -6,9 +6,9 @@ What the values are, and which steps are taken, is `fmu_mesh.instances.tight_gro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, Protocol, cast
 
 import msgspec
 from msgspec.structs import replace
@@ -20,7 +20,7 @@ from ..system.coupling_rule import SourceLine
 from .contract import Instance, KeepsFiles, LogMessage, Opening
 from .instance_wrapper import AroundInstance, of_kind, packed, unpacked
 
-__all__ = ["GroupState", "Span", "TightMember"]
+__all__ = ["GroupState", "GroupStep", "TightMember"]
 
 _NO_WAY_BACK: Final = (
     "In a group with `solve: newton`, each member goes back to the start of a step: leave out `solve`, or move this "
@@ -60,13 +60,26 @@ class _TightState(NamedTuple):
     own: _OwnState
 
 
-class Span(NamedTuple):
+class GroupStep(NamedTuple):
     """One step of all members: its number and size in s, and which part of a point it is (0 to 1)."""
 
     number: int
     size: float
     first: float = 0.0
     last: float = 1.0
+
+
+class StepsTogether(Protocol):
+    """A group, as its first member knows it."""
+
+    def step(self, step: int) -> None:
+        """Take own step ``step`` of all members."""
+        ...
+
+    @property
+    def cost(self) -> str:
+        """What its steps have cost, in words."""
+        ...
 
 
 class TightMember(AroundInstance[Instance]):
@@ -87,16 +100,15 @@ class TightMember(AroundInstance[Instance]):
         self._feedthrough = group.feedthrough[self.name]
         self._lines: list[SourceLine] = []
         self._ends: list[tuple[float, float]] = []  # of each outside line over the point
-        self._step: Callable[[int], None] | None = None  # of all members, if it is the first one
-        self._tell: Callable[[], str] | None = None
-        self._log = opening.log
+        self._group: StepsTogether | None = None  # if it is the first member
+        self._at, self._log = 0, opening.log
         self.known = GroupState()
         self.is_stepping = False  # for any thread
         self._goes_on = False
 
-    def lead(self, step: Callable[[int], None], tell: Callable[[], str]) -> None:
-        """The step of this member is that of the group, and at the end it says what that has cost."""
-        self._step, self._tell = step, tell
+    def lead(self, group: StepsTogether) -> None:
+        """The step of this member is that of the group."""
+        self._group = group
 
     def note(self, known: GroupState) -> None:
         """Keep what the group knows; only the first member is asked for it."""
@@ -133,8 +145,9 @@ class TightMember(AroundInstance[Instance]):
 
     def do_step(self, step: int) -> None:
         """See `Instance`."""
-        if self._step is not None:
-            self._step(step)
+        if self._group is not None:
+            self._group.step(step)
+            self._at = step + 1
 
     def begin(self, step: int) -> dict[int, float]:
         """Take the inputs of a point; returns the values of its unknowns there, by their numbers."""
@@ -152,7 +165,7 @@ class TightMember(AroundInstance[Instance]):
             self._goes_on &= abs(start - before.at(begin)) <= 0.5 * max(abs(before.change), abs(line.change))
         return {number: float(self._floats[self._columns[name]]) for name, number in self.solved.items()}
 
-    def take(self, span: Span, starts: Sequence[float], ends: Sequence[float], *, goes_on: bool) -> None:
+    def take(self, span: GroupStep, starts: Sequence[float], ends: Sequence[float], *, goes_on: bool) -> None:
         """One step, with unknowns that have these values at its start and its end."""
         courses = [(name, starts[number], ends[number]) for name, number in self.solved.items()]
         for item, (start, end) in zip(self._outside, self._ends, strict=True):
@@ -185,9 +198,9 @@ class TightMember(AroundInstance[Instance]):
 
     def close(self) -> None:
         """See `Instance`."""
-        if self._tell is not None:
-            self._log(LogMessage(self.name, "OK", "group", self._tell(), -1))
-            self._tell = None
+        if self._group is not None:
+            self._log(LogMessage(self.name, "OK", "group", self._group.cost, self._at))
+            self._group = None
         super().close()
 
     def remove_files(self) -> None:

@@ -82,11 +82,8 @@ def with_feedthrough(
 def _questions(system: ResolvedSystem) -> dict[str, _Question]:
     inputs: dict[str, dict[str, None]] = {}
     outputs: dict[str, dict[str, None]] = {}
-    instances, blocks, everywhere = (
-        system.instances,
-        blocks_of(system.config.members),
-        system.config.simulation.loops == "solved",
-    )
+    instances, blocks = system.instances, blocks_of(system.config.members)
+    everywhere = system.config.simulation.loops == "solved"
     for c in system.connections:
         same = instances[c.source_instance].step_points == instances[c.target_instance].step_points
         held = is_solved(c, blocks) and c.extrapolation != "linear"  # with a line, outputs belong to its end

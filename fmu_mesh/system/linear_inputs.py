@@ -44,9 +44,8 @@ def with_extrapolation(
 ) -> tuple[Connection, ...]:
     """The connections with their ways of extrapolation; a finding for every way that a target does not support.
 
-    Within a solved group it is `linear` where the target takes that: its line ends at the value that is solved.
-
-    What is said for an instance or for all holds for the inputs that can change within a step.
+    What is said for an instance or for all holds for the inputs that can change within a step. Within a solved group,
+    it is `linear` where the target takes that: its line ends at the value that is solved.
     """
     found, blocks = [], blocks_of(config.members)
     for c in connections:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import msgspec
 
 from ..config.findings import Findings
-from ..config.group_section import GroupConfig, Member, group_name, solved_groups_of
+from ..config.group_section import GroupConfig, GroupedInstance, Members, group_name, solved_groups_of
 from ..text import listed
 from ..variables.model_description import ModelDescription
 from .connections import Connection
@@ -69,7 +69,7 @@ class SolvedGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     feedthrough: dict[str, dict[str, dict[str, float]]]
 
 
-def blocks_of(members: Mapping[str, Member]) -> Blocks:
+def blocks_of(members: Members) -> Blocks:
     """The solved groups of a configuration."""
     solved, first, found = solved_groups_of(members), dict[str, str](), dict[str, str]()
     for name, member in members.items():
@@ -92,7 +92,10 @@ def within_block(connection: Connection, blocks: Blocks) -> bool:
 
 
 def solved_groups(
-    configured: Mapping[str, Member], connections: Sequence[Connection], order: Sequence[str], feedthrough: Feedthrough
+    configured: Members,
+    connections: Sequence[Connection],
+    order: Sequence[str],
+    feedthrough: Feedthrough,
 ) -> tuple[SolvedGroup, ...]:
     """The solved groups of a plan with these connections and this order of instances."""
     blocks, found = blocks_of(configured), list[SolvedGroup]()
@@ -120,7 +123,7 @@ def solved_groups(
 
 
 def check_solved_groups(
-    configured: Mapping[str, Member],
+    configured: Members,
     descriptions: Mapping[str, ModelDescription],
     connections: Sequence[Connection],
     findings: Findings,
@@ -150,7 +153,7 @@ def check_solved_groups(
 
 
 def _why_not(
-    name: str, member: Member, description: ModelDescription, own: GroupConfig
+    name: str, member: GroupedInstance, description: ModelDescription, own: GroupConfig
 ) -> Iterator[tuple[str, str, str]]:
     """What prevents that an instance is a member: the key, what was found, and what is expected."""
     version = description.fmi_version

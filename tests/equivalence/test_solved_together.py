@@ -134,3 +134,45 @@ def test_restored_and_written_states_go_on_with_the_same_floats(
     assert [result[one][1 + number] for number in (0, 7, 29) for one in names] == [
         one for number in (0, 7, 29) for one in rows[number]
     ]
+
+
+ARRAYS = """
+import fmu_mesh
+
+
+class Pair(fmu_mesh.Component):
+    u = fmu_mesh.Input([0.0, 0.0], shape=2)
+    e = fmu_mesh.Input([0.0, 0.0, 7.0], shape=3)
+    y = fmu_mesh.Output([0.0, 0.0], shape=2, depends_on=("u", "e"))
+
+    def initialize(self):
+        self.x = [1.0, -1.0]
+        self.tell()
+
+    def tell(self):
+        self.y = [x - 0.5 * u + 0.1 * e + 0.01 * self.e[2] for x, u, e in zip(self.x, self.u, self.e)]
+
+    def step(self, time, step_size):
+        self.x = [x + step_size * (u - x) for x, u in zip(self.x, self.u)]
+        self.tell()
+"""
+
+
+def test_arrays_and_their_elements_are_solved(place: Place) -> None:
+    (place.folder / "parts.py").write_text(ARRAYS, encoding="utf-8")
+    config = write_config(
+        place.folder,
+        instances={
+            "a": {"python": "parts.py:Pair", "group": {"name": "g", "solve": "newton"}},
+            "b": {"python": "parts.py:Pair", "group": "g"},
+        },
+        connections=["a.y -> b.u", "b.y -> a.u", "a.y[2] -> b.e[1]", "b.y[1] -> a.e[2]"],
+        simulation=SIMULATION,
+    )
+
+    launched = place.run("launch", config, "--no-progress")
+
+    assert launched.wait() == 0, launched.story()
+    assert config.with_suffix(".csv").read_bytes() == plain(config)
+    # Both are linear: with their direct dependences, two tries give the values of both ends.
+    assert "the group 'g' took 100 steps and 200 tries for 100 points" in launched.errors
