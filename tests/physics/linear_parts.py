@@ -6,14 +6,15 @@ coupling. The output `s` is the first state.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import fmu_mesh
 
-__all__ = ["COUPLED", "Coupled"]
+__all__ = ["COUPLED", "Coupled", "diagonal", "exponential"]
 
 Array = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ class Coupled(NamedTuple):
     def exact(self, step_size: float) -> Array:
         """The first states of both parts at all points: the whole is one linear system. Shape (points, 2)."""
         parts = self.one, self.two
-        a, b, c, d = (_diagonal([getattr(own, name) for own in parts]) for name in "abcd")
+        a, b, c, d = (diagonal([getattr(own, name) for own in parts]) for name in "abcd")
         inputs = [f"{name}.{one}" for name, own in zip(("one", "two"), parts, strict=True) for one in own.inputs]
         outputs = [f"{name}.{one}" for name, own in zip(("one", "two"), parts, strict=True) for one in own.outputs]
         link = np.zeros((len(inputs), len(outputs)))
@@ -122,7 +123,8 @@ class Coupled(NamedTuple):
         return np.array(rows)[:, [0, len(self.one.x)]]
 
 
-def _diagonal(blocks: list[list[list[float]]]) -> Array:
+def diagonal(blocks: Sequence[ArrayLike]) -> Array:
+    """Two blocks on the diagonal of one matrix."""
     first, second = (np.array(block, float) for block in blocks)
     result = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
     result[: len(first), : first.shape[1]], result[len(first) :, first.shape[1] :] = first, second

@@ -18,6 +18,7 @@ import pytest
 import fmu_mesh
 from tests.fmus.event_fmus import Version
 from tests.helpers import write_config
+from tests.physics.linear_parts import diagonal, exponential
 from tests.solved_systems import LINKS, MASSES, PARTS, masses
 
 EventFmu = Callable[..., Path]
@@ -65,17 +66,6 @@ SYSTEMS = {
 }
 
 
-def exponential(a: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    halvings = max(0, math.ceil(math.log2(max(1e-16, np.abs(a).sum(1).max())))) + 4
-    term = result = np.eye(len(a))
-    for number in range(1, 18):
-        term = term @ a / 2**halvings / number
-        result = result + term
-    for _ in range(halvings):
-        result = result @ result
-    return result
-
-
 def part(starts: Starts) -> tuple[Any, ...]:
     """The matrices A, B, C and D of a `LinearPart`; the outputs are x, v and y, the inputs u and w."""
     a, b, e, c, d, f = (starts.get(name, 0.0) for name in "abecdf")
@@ -91,7 +81,7 @@ def part(starts: Starts) -> tuple[Any, ...]:
 def exact(system: Coupled, step_size: float, count: int) -> np.ndarray[Any, Any]:
     """`one.x` and `two.x` at the points: the whole is one linear system."""
     parts = [part(system.one), part(system.two)]
-    a, b, c, d = (_diagonal([np.array(own[number], float) for own in parts]) for number in range(4))
+    a, b, c, d = (diagonal([np.array(own[number], float) for own in parts]) for number in range(4))
     links, constant = np.zeros((4, 6)), np.array([system.one.get("u", 0.0), 0.0, 0.0, 0.0])
     outputs = [f"{name}.{variable}" for name in ("one", "two") for variable in "xvy"]
     inputs = [f"{name}.{variable}" for name in ("one", "two") for variable in "uw"]
@@ -107,13 +97,6 @@ def exact(system: Coupled, step_size: float, count: int) -> np.ndarray[Any, Any]
     for _ in range(count):
         rows += [move @ rows[-1]]
     return np.array(rows)[:, [0, 2]]
-
-
-def _diagonal(blocks: list[np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
-    first, second = blocks
-    made = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
-    made[: len(first), : first.shape[1]], made[len(first) :, first.shape[1] :] = first, second
-    return made
 
 
 def error_of(
