@@ -106,6 +106,7 @@ def test_a_query_before_first_point_waits_for_it_and_not_for_ever(state: str, mo
         step=0,
         instance=SimpleNamespace(description=description),
         plan=SimpleNamespace(step_points=1),
+        player=None,
     )
     activity = SimpleNamespace(state=state, runners={"unit": runner}, ways=None, loops=(), status=lambda _name: 7)
     plan = SimpleNamespace(key_prefix="fmu_mesh", mesh="lab", grid=TimeGrid(0.0, 0.1, 10))
