@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -119,7 +120,10 @@ class Convergence(msgspec.Struct, frozen=True):
     def _cells(self) -> Iterator[tuple[str, ...]]:
         for own in self.variables:
             if own.error is None:
-                yield own.name, "", "", "", "", own.verdict
+                apart = own.differences[-1] / own.largest if own.largest else 0.0
+                known = own.verdict == _SAME or not math.isfinite(apart)
+                more = "" if known else f"; the two finest runs differ by {apart:.1g} of its largest value"
+                yield own.name, "", "", "", "", f"{own.verdict}{more}"
             else:
                 error, relative = f"{own.error:.2g} {own.unit or ''}".rstrip(), f"{own.error / own.largest:.1g}"
                 yield own.name, f"{own.order:.2f}", f"{own.rms_order:.2f}", error, relative, ""
