@@ -30,9 +30,9 @@ from ..run.copies import Copies
 from ..run.copies_messages import FIRST_COPIES
 from ..run.limits import resident_bytes
 from ..run.local_system import forwarded
-from ..run.preparing import OtherStartValues
 from ..run.process import interrupts_later
 from ..run.process_copies import ProcessCopies
+from ..run.resetting import OtherStartValues
 from ..run.run_plan import RunPlan
 from ..run.system_copy import Overrides, SavedCopy
 from ..text import option_text, shown

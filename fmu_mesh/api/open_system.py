@@ -28,7 +28,7 @@ from ..instances.registry import open_instance
 from ..run.local_system import LocalSystem, SavedSystem, forwarded, opening_of
 from ..run.one_process import OneProcess
 from ..run.options import ResetOptions
-from ..run.preparing import OtherStartValues
+from ..run.resetting import OtherStartValues
 from ..run.run_plan import RunPlan
 from ..run.state_file import StateFile, state_bytes, with_replaced, write_state
 from ..simtime import ENDLESS

@@ -23,8 +23,8 @@ from ..results.recording import Columns, ResultFile, joined
 from ..run.options import PlanOptions
 from ..run.outcome import Outcome
 from ..run.overriding import memory_of
-from ..run.preparing import OtherStartValues
 from ..run.repeated import RepeatedRuns
+from ..run.resetting import OtherStartValues
 from ..run.run_plan import RunPlan
 from ..variables.value_types import DTYPES, VariableType
 from ..wire.runtime import fmu_folder, remove_stale_folders, run_folder, run_name

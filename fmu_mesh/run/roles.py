@@ -373,7 +373,8 @@ class _MasterRuns:
         Raises:
             ConfigurationError: it cannot be run.
         """
-        from .preparing import KnownModels, planned_reset  # noqa: PLC0415  most runs are never reset
+        from .preparing import KnownModels  # noqa: PLC0415  most runs are never reset
+        from .resetting import planned_reset  # noqa: PLC0415  as above
 
         self._known = self._known or KnownModels.of(self._first)
         run = replace(planned_reset(self._first, start_values, resets, self._known), rows=())

@@ -57,6 +57,7 @@ class Reference(msgspec.Struct, frozen=True):
         units: in the order in which they are stepped at a point.
         recorded: (unit, output) of each column but the time.
         loops: the pipes at which each algebraic loop at the start is torn; what comes first stands first.
+        relaxation: how much of the difference an iteration of a loop takes away.
         changes: values by (unit, variable) and the point at which a step begins; each is set before this step.
     """
 
@@ -67,6 +68,7 @@ class Reference(msgspec.Struct, frozen=True):
     recorded: Sequence[tuple[str, str]]
     start_time: float = 0.0
     loops: Sequence[Sequence[Pipe]] = ()
+    relaxation: float = 1.0
     changes: Mapping[tuple[str, str], Mapping[int, float]] = {}
 
 
@@ -177,7 +179,8 @@ def _settle(reference: Reference, fmus: Mapping[str, _Fmu]) -> None:
             residuals = [abs(new - old) / max(1.0, abs(new)) for old, new in zip(assumed, brought, strict=True)]
             if max(residuals) <= 1e-9:
                 break
-            assumed = brought
+            relaxed = [old + reference.relaxation * (new - old) for old, new in zip(assumed, brought, strict=True)]
+            assumed = relaxed if reference.relaxation < 1.0 else brought
     _propagate(reference, fmus, settled)
 
 

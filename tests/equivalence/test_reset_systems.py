@@ -63,6 +63,10 @@ def changed_values(system: System, seed: int) -> dict[str, float]:
     return found
 
 
+SOLVED = {"consistent", "masses"}
+"""The systems whose loops are solved at every point."""
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_reset_system_equals_a_new_one(name: str, tmp_path: Path) -> None:
     run = plan_run(written_system(name, tmp_path))
@@ -90,10 +94,15 @@ def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tm
                     continue
                 with opened as other:
                     wanted = rows_of(other)
-                system.reset(values)
+                try:
+                    system.reset(values)
+                except ConfigurationError as refused:  # other start values, other formulas of the solved loops
+                    assert name in SOLVED
+                    assert "its outputs would depend directly on inputs in another way" in str(refused)
+                    continue
                 assert rows_of(system) == wanted
                 accepted += bool(values)
-        assert accepted or name == "text and arrays"
+        assert accepted or name in {"text and arrays", *SOLVED}
         system.reset()
         assert rows_of(system) == expected
 

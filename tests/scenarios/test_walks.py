@@ -12,8 +12,8 @@ from tests.walks import WALKS, walked
 # node (a module of its own); and of an error, on which host it happened, and whether the run ends with it. The error
 # takes some functions more or fewer, as its processes hear of it in another order.
 MOST = {
-    "start value": (34, 92),
-    "SSP parameter": (42, 111),
+    "start value": (34, 96),
+    "SSP parameter": (42, 115),
     "error of a component": (29, 62),
 }
 

@@ -16,7 +16,7 @@ import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, FmuError, NotFinite
 from fmu_mesh.rings import native
 from fmu_mesh.run.hosted_system import HostedSystem
-from fmu_mesh.run.preparing import OtherStartValues
+from fmu_mesh.run.resetting import OtherStartValues
 from tests.fmus.helpers import FMUS
 from tests.helpers import PAIR, examples, write_config
 from tests.onnx_models import write_network
