@@ -184,6 +184,15 @@ static int move_values(const Move *move, const char *from, char *to) {
       memcpy(to, from, (size_t)(move->count * from_size));
     return 0;
   }
+  if (move->count == 1 && from_type == F64 && to_type == F64 && move->change != UNCHANGED && !move->negated) {
+    double value, before; /* as below, and several times as fast */
+    memcpy(&value, from, 8);
+    memcpy(&before, to, 8);
+    value = value * move->factor + move->offset;
+    if (move->change == ADDED) value = before + value;
+    memcpy(to, &value, 8);
+    return 0;
+  }
   for (int64_t i = 0; i < move->count; i++, from += from_size, to += to_size) {
     if (move->change == SCALED || move->change == ADDED || from_type <= F32 || to_type <= F32) {
       double value = as_double(from, from_type);
