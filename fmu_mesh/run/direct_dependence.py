@@ -60,6 +60,11 @@ def with_feedthrough(
     edges = [(c.source_instance, c.target_instance) for c in system.connections if not c.initial_only]
     cycles = [part for part in strongly_connected(system.instances, edges) if is_cycle(part, edges)]
     for name, answer in known.items():
+        own = system.instances[name]
+        inputs = {one.name for one in own.description.with_causality("input")}
+        if answer.derivatives and (changed := [one.variable for one in own.scenario if one.variable not in inputs]):
+            what = "how its outputs depend directly on inputs stays as it is at the start"
+            warnings.add(f"instances.{name}", f"the scenario changes {listed(changed)}; {what}", "")
         why = answer.failure or (f"{listed(answer.changing)} is no constant" if answer.changing else "")
         if not why:
             continue

@@ -184,6 +184,18 @@ def test_a_given_feedthrough_is_taken_for_what_it_says(tmp_path: Path) -> None:
     assert fmu_mesh.load(written(content, tmp_path)).plan().plan.consistent == given
 
 
+def test_a_scenario_that_changes_a_gain_of_a_solved_loop_is_told(tmp_path: Path) -> None:
+    content = consistent_loop() | {"scenario": {"events": [{"at": 1.0, "set": {"gain.k": -1.0, "sum.u1": 0.0}}]}}
+    content["connections"] = content["connections"][1:]
+
+    told = [str(one) for one in fmu_mesh.load(written(content, tmp_path)).check().warnings]
+
+    assert [one for one in told if "the scenario changes" in one] == [
+        one for one in told if "changes k; how its" in one
+    ]
+    assert any("changes k; how its outputs depend directly on inputs stays" in one for one in told)
+
+
 def test_a_delay_of_zero_within_a_solved_cycle_is_refused(tmp_path: Path) -> None:
     content = loop_with({"fmu": str(FMUS / "Gain.fmu"), "start_values": {"k": 0.5}})
     content["connections"][0] = {"from": "gain.y", "to": "other.u", "delay": 0}
