@@ -190,10 +190,8 @@ def test_a_scenario_that_changes_a_gain_of_a_solved_loop_is_told(tmp_path: Path)
 
     told = [str(one) for one in fmu_mesh.load(written(content, tmp_path)).check().warnings]
 
-    assert [one for one in told if "the scenario changes" in one] == [
-        one for one in told if "changes k; how its" in one
-    ]
-    assert any("changes k; how its outputs depend directly on inputs stays" in one for one in told)
+    (own,) = [one for one in told if "the scenario changes" in one]
+    assert "changes k; how its outputs depend directly on inputs stays as it is at the start" in own
 
 
 def test_a_delay_of_zero_within_a_solved_cycle_is_refused(tmp_path: Path) -> None:

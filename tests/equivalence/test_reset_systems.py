@@ -94,11 +94,14 @@ def test_other_start_values_give_floats_of_system_opened_with_them(name: str, tm
                     continue
                 with opened as other:
                     wanted = rows_of(other)
+                refused = ""
                 try:
                     system.reset(values)
-                except ConfigurationError as refused:  # other start values, other formulas of the solved loops
+                except ConfigurationError as error:  # other start values, other formulas of the solved loops
+                    refused = str(error)
+                if refused:
                     assert name in SOLVED
-                    assert "its outputs would depend directly on inputs in another way" in str(refused)
+                    assert "its outputs would depend directly on inputs in another way" in refused
                     continue
                 assert rows_of(system) == wanted
                 accepted += bool(values)
