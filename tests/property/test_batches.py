@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
-from fmu_mesh.run import preparing
+from fmu_mesh.run import resetting
 from fmu_mesh.run.run_plan import RunPlan
 from tests.helpers import FMUS, examples
 
@@ -509,13 +509,13 @@ def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None
 def test_a_batch_is_planned_once_for_the_same_start_values(
     gains: fmu_mesh.Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planned, original = list[object](), preparing.planned
+    planned, original = list[object](), resetting.planned
 
     def counting(*given: Any, **named: Any) -> RunPlan:  # noqa: ANN401  those of the function
         planned.append(given)
         return original(*given, **named)
 
-    monkeypatch.setattr(preparing, "planned", counting)
+    monkeypatch.setattr(resetting, "planned", counting)
     for value in (1.0, 2.0, 3.0):
         gains.reset(start_values={"gain.k": [value, -value]})
         assert gains.get("gain.k").tolist() == [value, -value]
