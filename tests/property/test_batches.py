@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.rings import native
-from fmu_mesh.run import resetting
+from fmu_mesh.run import preparing, resetting
 from fmu_mesh.run.run_plan import RunPlan
 from tests.helpers import FMUS, examples
 
@@ -509,7 +509,7 @@ def test_start_values_of_other_copies_are_ignored(gains: fmu_mesh.Batch) -> None
 def test_a_batch_is_planned_once_for_the_same_start_values(
     gains: fmu_mesh.Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planned, original = list[object](), resetting.planned
+    planned, original = list[object](), preparing.planned
 
     def counting(*given: Any, **named: Any) -> RunPlan:  # noqa: ANN401  those of the function
         planned.append(given)
