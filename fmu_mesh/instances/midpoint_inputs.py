@@ -66,8 +66,7 @@ class MidpointInputs(AroundNativeSteps):
         """See `Instance`."""
         row, lines, begin = self._row.part("Float64")[step & self._row.mask], self._known, step * self._points
         for number, (item, column) in enumerate(zip(self._inputs, self._columns, strict=True)):
-            latest = begin if item.delay else begin + self._points
-            latest -= latest % item.source_points
+            latest = item.latest(begin, self._points)
             lines[number] = line = lines[number].through(float(row[column]), latest)
             row[column] = line.middle(begin, self._points)
         self._put(lines)

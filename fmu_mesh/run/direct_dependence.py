@@ -35,7 +35,7 @@ _AT_ONCE = 4
 
 
 class _Question(NamedTuple):
-    """The inputs and outputs of an instance between which there may be something, and all that it has."""
+    """The inputs of an instance, and the outputs that may depend directly on them."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -112,9 +112,9 @@ def _questions(system: ResolvedSystem) -> dict[str, _Question]:
             and variable.changes
             and variable.feedthrough != ()
         )
-        if direct or own:
+        if direct:
             found[name] = _Question(tuple(own), direct)
-    return {name: question for name, question in found.items() if question.outputs}
+    return found
 
 
 def _answer(

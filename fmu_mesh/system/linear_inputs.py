@@ -35,6 +35,11 @@ class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     source_points: int = 1
     ends: bool = False
 
+    def latest(self, begin: int, points: int) -> int:
+        """The point of the row of the source that a step of so many points gets, as in `CouplingRule`."""
+        end = begin if self.delay else begin + points
+        return end - end % self.source_points
+
 
 def with_extrapolation(
     config: Config,

@@ -67,8 +67,7 @@ class LinearInputs(AroundInstance[FmuInstance]):
         slopes = {}
         for number, item in enumerate(self._inputs):
             column, before = self._columns[number], self._lines[number]
-            latest = begin if item.delay else begin + self._points
-            line = before.through(float(row[column]), latest - latest % item.source_points)  # as in `CouplingRule`
+            line = before.through(float(row[column]), item.latest(begin, self._points))
             row[column] = value = line.at(begin)
             # An extrapolation of a smooth source is wrong by less than what it changes in a step of its own.
             allowed = 0.5 * max(abs(before.change), abs(line.change))
