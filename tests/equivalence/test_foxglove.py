@@ -217,11 +217,13 @@ def test_log_messages_are_shown_also_those_from_before(place: Place) -> None:
         wait_until(lambda: "is connected to" in place.run("logs", "pair").output, "the message in the log")
         client.subscribe("/log")
         client.until(lambda: client.messages["/log"], "the message from before")
-        session.put("fmu_mesh/pair/delay/set/x", "1.0")
+        session.put("fmu_mesh/pair/delay/set/y", "1.0")  # another key: refusals at one key in a short time are one line
         client.until(lambda: len(client.messages["/log"]) == 2, "the next message")
 
     assert client.channels["/log"]["schemaName"] == "foxglove.Log"
-    assert all(b"is connected to 'pendulum'" in data for _, data in client.messages["/log"])
+    before, after = (data for _, data in client.messages["/log"])
+    assert b"is connected to 'pendulum'" in before
+    assert b"'delay.y'" in after
 
 
 def test_times_before_zero_are_shifted(place: Place) -> None:

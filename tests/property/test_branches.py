@@ -159,13 +159,14 @@ def test_a_large_state_comes_in_parts_and_leaves_no_memory_behind(tmp_path: Path
     with mesh.start(record="memory", paused=True) as run:
         run.step(100)
         found = []
-        for _ in range(4):
+        for _ in range(10):
             assert run.checkpoint(state, timeout=DEADLINE_S) == 100
             found.append(in_use())
         run.resume()
         assert_goes_on(run.wait(), whole, 0)
     assert state.stat().st_size > 2**27
-    assert max(found[1:]) < found[0] + 64  # each state has twice as much
+    # Each state that stayed would add 128. The allocator may keep the parts of one or two for the next one.
+    assert max(found) < found[0] + 3 * 128, found
     assert_goes_on(mesh.run(record="memory", state=state), whole, 100)
 
 
