@@ -11,17 +11,17 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..simtime import TimeGrid
 from ..system.coupling_rule import Consistent, lines_through
+from ..system.defect import Defect
 from ..system.feeds import Compared
 from ..system.plan import Plan
 from .growth import ReadColumn
 
-__all__ = ["Defect", "DefectWatch"]
+__all__ = ["DefectWatch"]
 
 _CHUNK: Final = 8192
 """Differences that are added up at once. Sums of floats depend on what is added first, so chunks begin at multiples of
@@ -29,26 +29,6 @@ it, whatever the blocks are in which rows are written."""
 
 _BEFORE: Final = 2
 """Values before a chunk that tell the line at its first one, and whether that one has jumped."""
-
-
-class Defect(msgspec.Struct, frozen=True):
-    """How far what a target assumed was from what came: a pointer to the connection, and no estimate of an error.
-
-    Attributes:
-        maximum: the largest difference, in the unit of the input.
-        point: the point at which the value came that differs most.
-        time: the simulation time of that point in s.
-        rms: root mean square of all differences, in the unit of the input.
-        relative: the largest difference divided by the range of the input in the run; 0 if it was constant.
-        steps: number of differences: the steps of the target in which a value came.
-    """
-
-    maximum: float
-    point: int
-    time: float
-    rms: float
-    relative: float
-    steps: int
 
 
 class DefectWatch:

@@ -12,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from fmu_mesh.config.instance_sections import Extrapolation
-from fmu_mesh.results.defects import Defect, DefectWatch
+from fmu_mesh.results.defects import DefectWatch
 from fmu_mesh.simtime import TimeGrid
 from fmu_mesh.system.coupling_rule import Consistent, CouplingRule, SourceLine, Term, lines_through
+from fmu_mesh.system.defect import Defect
 from fmu_mesh.system.feeds import Compared
 from fmu_mesh.system.plan import Plan
 
