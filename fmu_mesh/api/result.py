@@ -24,12 +24,12 @@ from ..pictures.result_drawing import FLAGS, NUMBERS, Curve, Curves, PictureOpti
 from ..pictures.tables import html_table
 from ..results.column_names import chosen_names, of_one_instance
 from ..results.csv_file import CsvFile
-from ..results.defects import Defect
 from ..results.formats import read_result, result_pieces
 from ..results.parquet_file import ParquetFile
 from ..results.recording import Columns, ResultFile, joined
 from ..run.outcome import Outcome
 from ..run.run_plan import RunPlan
+from ..system.defect import Defect
 from ..system.run_metadata import machine_difference
 from ..system.system import ResolvedSystem
 from ..text import listed, short_path

@@ -172,7 +172,7 @@ class Run:
         return self._client().all_status()
 
     def graph(self) -> SystemGraph:
-        """The graph of the mesh, with the state and the speed of each instance while it runs.
+        """The graph of the mesh, with the state and the speed of each instance, and defects, while it runs.
 
         `SystemGraph.with_status` renews these without another question for what does not change.
 
@@ -186,15 +186,15 @@ class Run:
         from ..pictures.system_graph import graph_of_infos, graph_of_plan  # noqa: PLC0415  only this needs it
 
         if self._own is None:
-            client = self._client()
-            mesh = client.info()
-            infos = [client.instance_info(name) for name in mesh.instances]
+            mesh = self._client().info()
+            infos = [*map(self._client().instance_info, mesh.instances)]
             graph = replace(graph_of_infos(self.name, infos), topics=mesh.topics)
-            return graph.with_status(client.all_status()[1])
-        graph = graph_of_plan(self._own.plan.plan)
-        if self._own.in_process or self._own.future.done():
-            return graph
-        return graph.with_status(self._client().all_status()[1])
+        else:
+            graph = graph_of_plan(self._own.plan.plan)
+            if self._own.in_process or self._own.future.done():
+                return graph
+        status, instances = self._client().all_status()
+        return graph.with_status(instances, defects=status.defects)
 
     @property
     def variables(self) -> dict[str, VariableView]:

@@ -25,6 +25,7 @@ is made of what is there, and never waits for the mesh.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import OrderedDict, deque
@@ -37,9 +38,11 @@ import msgspec
 import numpy as np
 
 from ..api.attaching import attach
+from ..api.result import Result
 from ..api.run_handle import Run
 from ..errors import DeadlineExceeded, FmuMeshError, Interrupted, MeshLost
 from ..pictures.system_graph import SystemGraph, graph_of_infos
+from ..system.defect import Defect
 from ..variables.value_types import element_names
 from ..wire.views import InstanceInfo, InstanceStatus, LogLine, MeshInfo, MeshStatus, VariableView
 from .curve import BoundedCurve, CurveChange, Looks
@@ -55,6 +58,8 @@ _SAMPLE_S: Final = 0.05
 """Time between two looks for new values while the mesh runs, in s."""
 _AGAIN_S: Final = 1.0
 """Time until a mesh that has ended is looked for again, and how long the report of its failure may take, in s."""
+_CLOSED_S: Final = 10.0
+"""How long a run may take after its end to close its result file, in s."""
 _ASKED_S: Final = 10.0
 """A value that is in no result file is asked for this long after the last page has shown it."""
 _LOG_LINES: Final = 500
@@ -87,6 +92,7 @@ class MeshView(msgspec.Struct, frozen=True):
         infos: what the instances are, in the order of the mesh.
         trouble: why it is not reached.
         failure: why the run failed; None if it did not, or goes on.
+        defects: those of the newest status; of a run that has ended, those in its result file if that is here.
         run: counts the runs of a mesh of this name that were seen.
     """
 
@@ -100,6 +106,7 @@ class MeshView(msgspec.Struct, frozen=True):
     ended: bool = False
     trouble: str | None = None
     failure: str | None = None
+    defects: Mapping[str, Defect] = {}
     run: int = 0
 
 
@@ -131,7 +138,7 @@ class MeshFollower:
         self._asked: dict[str, float] = {}
         self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
         self._drawing = threading.Lock()
-        self._drawn: tuple[tuple[int, Mapping[str, InstanceStatus]], str] | None = None
+        self._drawn: tuple[tuple[object, ...], str] | None = None
         self._sampler: threading.Thread | None = None
         self._next_run = threading.Event()
         self._closing = threading.Event()
@@ -145,12 +152,13 @@ class MeshFollower:
         return self._view
 
     def picture(self) -> str:
-        """The SVG of the graph with the state and the speed of each instance; pages share it."""
+        """The SVG of the graph with the state and the speed of each instance, and with defects; pages share it."""
         view = self._view
+        drawn_of = view.run, view.instances, view.defects
         with self._drawing:
-            if self._drawn is None or self._drawn[0] != (view.run, view.instances):
-                graph = view.catalogue.graph.with_status(view.instances, view.before)
-                self._drawn = (view.run, view.instances), graph.svg()
+            if self._drawn is None or self._drawn[0] != drawn_of:
+                graph = view.catalogue.graph.with_status(view.instances, view.before, view.defects)
+                self._drawn = drawn_of, graph.svg()
             return self._drawn[1]
 
     @property
@@ -276,7 +284,7 @@ class MeshFollower:
             return False
         # Rates are those of about a second: in a shorter time an instance may take no step at all.
         old = before.instances if _is_a_second(before.before, before.instances) else before.before
-        self._change(status=status, instances=instances, before=old, trouble=None)
+        self._change(status=status, instances=instances, before=old, trouble=None, defects=status.defects)
         return True
 
     def _change(self, **fields: object) -> None:
@@ -297,7 +305,7 @@ class MeshFollower:
 
     def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
         path = Path(info.result_file) if info.result_file is not None and info.is_here else None
-        source, looks = ResultSource(path), Looks(_SAMPLE_S)
+        source, looks, closed_at = ResultSource(path), Looks(_SAMPLE_S), math.inf
         try:
             while not (self._closing.is_set() or self._next_run.is_set()):
                 over = ended.is_set()
@@ -305,6 +313,10 @@ class MeshFollower:
                     if source.replaced:
                         return
                     source.read_all(self._held)
+                    closed_at = min(closed_at, time.monotonic() + _CLOSED_S)
+                    if self._view.defects and time.monotonic() < closed_at and (defects := _defects_in(path)):
+                        closed_at = 0.0
+                        self._change(defects=defects)
                 else:
                     source.read(self._held, self._forget)
                     self._ask_for_values(run, source.names, looks)
@@ -356,6 +368,14 @@ def _failure(run: Run) -> str | None:
     except FmuMeshError as error:
         return None if isinstance(error, DeadlineExceeded | Interrupted) else str(error)
     return None
+
+
+def _defects_in(path: Path | None) -> Mapping[str, Defect]:
+    """Those of a whole run, which its file has when it is closed."""
+    try:
+        return Result("", file=path).defects
+    except FmuMeshError:
+        return {}
 
 
 def _catalogue_of(mesh: str, infos: Mapping[str, InstanceInfo]) -> Catalogue:

@@ -14,6 +14,7 @@ from nicegui import run, ui
 
 from ..api.run_handle import Run
 from ..errors import FmuMeshError
+from ..pictures.tables import DEFECT_COLUMNS, defect_rows
 from ..printing import paragraph
 from ..wire.views import InstanceStatus
 from .mesh_follower import Catalogue, MeshFollower, MeshView
@@ -45,6 +46,7 @@ _BAR: Final = """
 <div :style="{width: props.row.share[0] + '%'}"></div><div :style="{width: props.row.share[1] + '%'}"></div>
 </div></q-td>
 """
+_DEFECTS: Final = "Largest defects: a pointer to the connection, no error estimate"
 _PLOTS: Final = 4
 _CURVES: Final = 5
 _HELD: Final = ("parameter", "calculatedParameter")
@@ -158,6 +160,9 @@ class MeshPage:
             self._picture.classes("fm-graph").props(
                 "role=img aria-label='the instances and their connections' tabindex=0"
             )
+            columns = [{"name": name, "label": name, "field": name, "align": "left"} for name in DEFECT_COLUMNS]
+            self._defects = ui.table(rows=[], columns=columns, row_key=DEFECT_COLUMNS[0], title=_DEFECTS)
+            self._defects.classes("fm-defects fm-numbers").props("dense flat hide-pagination wrap-cells")
 
     def _add_settings(self) -> None:
         settable = self._view.catalogue.settable
@@ -199,6 +204,10 @@ class MeshPage:
             self._pausing.set_visibility(state != "paused")
             self._resuming.set_visibility(state == "paused")
             self._buttons.set_visibility(not view.ended)
+        rows = [dict(zip(DEFECT_COLUMNS, row, strict=True)) for row in defect_rows(view.defects)]
+        self._defects.set_visibility(bool(rows))
+        if rows != self._defects.rows:
+            self._defects.update_rows(rows)
         self._show_log()
 
     def _show_log(self) -> None:

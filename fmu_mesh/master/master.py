@@ -57,6 +57,7 @@ from ..errors import (
 )
 from ..rings.host_memory import HostMemory, can_share
 from ..system.attempt import Attempt
+from ..system.defect import Defect
 from ..system.memory_map import STREAMS
 from ..system.plan import MASTER, RECORDER, Plan
 from ..system.round_trip import round_trip_cost
@@ -129,6 +130,7 @@ class Master:
         self._first_plan = plan
         self._replan = replan
         self._resets, self._start = 0, NewStart(0, plan.digest, {})
+        self._defects: dict[str, Defect] = {}
         attempt = settings.attempt
         self._journal: Journal[Commanded] = Journal(attempt.journal, Commanded)
         self._states = MasterStates(
@@ -228,11 +230,12 @@ class Master:
         server.serve(keys.report("*"), self._take_report, of_run=True)
         server.watch(keys.node("*"), self._members.token_changed, of_run=True)
 
-    def run(self, check: Callable[[], None] = lambda: None) -> None:
+    def run(self, check: Callable[[], None] = lambda: None, defects: Callable[[], dict[str, Defect]] = dict) -> None:
         """Run the mesh to its last point.
 
         Args:
             check: called several times a second; an error that it raises ends the run.
+            defects: those for the status.
 
         Raises:
             FmuMeshError: why the run ended early; all nodes have been informed.
@@ -243,6 +246,7 @@ class Master:
             while not states.is_over:
                 try:
                     check()
+                    self._defects = defects()
                 except FmuMeshError as error:
                     states.fail(error)
                 pause_s = self._decide(awake())
@@ -589,4 +593,5 @@ class Master:
             cut=self.streams.cut if self.streams is not None else {},
             resets=self._resets,
             missing=tuple(states.registrations.missing) if states.state == "starting" else (),
+            defects=self._defects,
         )

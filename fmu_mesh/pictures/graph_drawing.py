@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from ..config.key_sections import KEY
+from ..system.defect import Defect, DefectWords
 from .drawing import CYCLE_COLOURS, FAINT, INK, STATE_COLOURS, WIRE
 from .graph_layout import Arrangement, Dot, Wire, arranged
 from .result_drawing import in_unit
@@ -161,7 +162,7 @@ class DrawnInstance(NamedTuple):
 
 
 class DrawnWire(NamedTuple):
-    """A wire from port to port."""
+    """A wire from port to port; ``has_ring``: one of its connections has the largest defect."""
 
     edge: int
     path: tuple[Dot, ...]
@@ -169,6 +170,7 @@ class DrawnWire(NamedTuple):
     width: float
     dashed: bool
     tip: str
+    has_ring: bool = False
 
 
 class Drawing(NamedTuple):
@@ -211,13 +213,19 @@ class _Plan(NamedTuple):
 
 
 def drawing_of(
-    title: str, nodes: Sequence[GraphNode], edges: tuple[GraphEdge, ...], cycles: Sequence[Sequence[str]]
+    title: str,
+    nodes: Sequence[GraphNode],
+    edges: tuple[GraphEdge, ...],
+    cycles: Sequence[Sequence[str]],
+    defects: Mapping[str, Defect] = {},
 ) -> Drawing:
     """The shapes of a graph."""
     is_live = any(node.state is not None for node in nodes)
     plan = _planned(tuple((node.instance, node.caption, node.group) for node in nodes), edges, is_live)
     cycle_of = {name: number for number, cycle in enumerate(cycles) for name in cycle}
     instances = [_drawn_instance(node, plan, cycle_of.get(node.instance), is_live=is_live) for node in nodes]
+    known = DefectWords(defects)
+    differences = [known.largest_among(_input_units(edges[port.edge], port)) for port, _ in plan.wires]
     wires = [
         DrawnWire(
             port.edge,
@@ -225,9 +233,10 @@ def drawing_of(
             WIRE if (cycle := edges[port.edge].cycle) is None else CYCLE_COLOURS[cycle % len(CYCLE_COLOURS)],
             1.4 if cycle is None else 2.1,
             edges[port.edge].delay > 0,
-            port.tip,
+            port.tip + text,
+            0.0 < relative == known.most,
         )
-        for port, path in plan.wires
+        for (port, path), (text, relative) in zip(plan.wires, differences, strict=True)
     ]
     groups = [
         (box, Label(box.x + _PAD, box.y + 16.0, f"group {shortened(name, 40)}: one process", 11.0, FAINT))
@@ -236,7 +245,8 @@ def drawing_of(
     labels, height = [Label(_MARGIN, _MARGIN + 8.0, title, 14.0, bold=True)], plan.height
     dashed = "dashed: delay 1, the step uses the value at its start" if any(edge.delay > 0 for edge in edges) else ""
     thick = "thick and coloured: a cycle" if any(edge.cycle is not None for edge in edges) else ""
-    if legend := "; ".join(filter(None, (dashed, thick))):
+    ring = "ring: the largest defect relative to a range" if any(wire.has_ring for wire in wires) else ""
+    if legend := "; ".join(filter(None, (dashed, thick, ring))):
         labels.append(Label(_MARGIN, height, legend, 11.0, FAINT))
         height += 18.0
     width = max(plan.width, *(_text_width(label) + 2.0 * _MARGIN for label in labels))
@@ -407,6 +417,15 @@ def _tip(edge: GraphEdge, variable: GraphVariable) -> str:
     end += (", closes a cycle" if edge.closes_cycle else "") + (f", map {variable.map}" if variable.map else "")
     ends = (edge.source, variable.source), (edge.target, variable.target)
     return " -> ".join(f"{name} ({own})" if name.startswith(KEY) else f"{name}.{own}" for name, own in ends) + end
+
+
+def _input_units(edge: GraphEdge, port: _Port) -> dict[str, str]:
+    """The connections of a wire, as `a.y -> b.u`, with the units of their inputs."""
+    return {
+        f"{edge.source}.{own.source} -> {edge.target}.{own.target}": own.target_unit
+        for own in edge.variables
+        if port.source in (port.edge, own.source) and port.target in (port.edge, own.target)
+    }
 
 
 def _port_text(name: str, unit: str) -> str:

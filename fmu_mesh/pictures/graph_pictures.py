@@ -50,6 +50,11 @@ def _arrow(end: Dot) -> tuple[Dot, Dot, Dot]:
     return (x, y), (x - 8.0, y - 4.0), (x - 8.0, y + 4.0)
 
 
+def _ring(end: Dot) -> Dot:
+    """The middle of a ring behind the arrow."""
+    return end[0] - 13.0, end[1]
+
+
 # --- SVG
 
 
@@ -73,10 +78,13 @@ def svg_of_drawing(drawing: Drawing) -> str:
             dashes = ' stroke-dasharray="6 4"' if wire.dashed else ""
             moves = ((command, " ".join(f"{x:.1f} {y:.1f}" for x, y in dots)) for command, dots in _moves(wire.path))
             commands = "".join(chain.from_iterable(moves))
+            x, y = _ring(wire.path[-1])
+            ring = f'<circle class="ring" cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#ffffff" stroke="{wire.colour}"/>'
+            tip = "\n".join(map(escaped, wire.tip.split("\n")))
             lines.append(
                 f'<g><path d="{commands}" fill="none" stroke="{wire.colour}" stroke-width="{wire.width}"{dashes}/>'
                 f'<polygon points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in _arrow(wire.path[-1]))}" '
-                f'fill="{wire.colour}"/><title>{escaped(wire.tip)}</title></g>'
+                f'fill="{wire.colour}"/>{ring if wire.has_ring else ""}<title>{tip}</title></g>'
             )
         lines.append("</g>")
     for instance in drawing.instances:
@@ -162,6 +170,8 @@ def figure_of_drawing(drawing: Drawing) -> Figure:
             )
         )
         axes.add_patch(Polygon(_arrow(wire.path[-1]), facecolor=wire.colour, edgecolor="none"))
+        if wire.has_ring:
+            axes.add_patch(Circle(_ring(wire.path[-1]), 4.0, facecolor="white", edgecolor=wire.colour, linewidth=0.75))
     for instance in drawing.instances:
         rectangle(instance.box, "white", instance.border, 2.4 if instance.is_in_cycle else 1.2, 5.0)
         if instance.dot is not None:

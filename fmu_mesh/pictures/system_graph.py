@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from ..config.key_sections import KEY, KeyView
 from ..config.ros_section import MeshTopic
 from ..printing import page
+from ..system.defect import Defect
 from ..system.graph import strongly_connected, topological_order
 from ..system.value_map import map_text
 from ..text import counted
@@ -65,6 +66,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
         cycles: the instances of each cycle.
         topics: those in ROS; a picture has none of them.
         keys: the Zenoh keys at ends of connections.
+        defects: by connection, what is known of them; a wire shows them when somebody points at it.
     """
 
     mesh: str
@@ -73,6 +75,7 @@ class SystemGraph(msgspec.Struct, frozen=True):
     cycles: tuple[tuple[str, ...], ...] = ()
     topics: tuple[MeshTopic, ...] = ()
     keys: tuple[KeyView, ...] = ()
+    defects: dict[str, Defect] = {}
 
     @property
     def title(self) -> str:
@@ -89,7 +92,10 @@ class SystemGraph(msgspec.Struct, frozen=True):
         return f"{self.mesh}: {', '.join(counts)}"
 
     def with_status(
-        self, instances: Mapping[str, InstanceStatus], before: Mapping[str, InstanceStatus] | None = None
+        self,
+        instances: Mapping[str, InstanceStatus],
+        before: Mapping[str, InstanceStatus] | None = None,
+        defects: Mapping[str, Defect] = {},
     ) -> SystemGraph:
         """The same graph with the state of each instance and key, as `Run.all_status` has it.
 
@@ -104,10 +110,12 @@ class SystemGraph(msgspec.Struct, frozen=True):
         Args:
             instances: the status of each instance; one that is missing gets no values.
             before: that of an earlier look, for the speed since then; None: the mean speed since the first point.
+            defects: those of `MeshStatus` or of a `Result`, for the edges.
         """
         nodes = [_live(node, instances.get(node.instance), (before or {}).get(node.instance)) for node in self.nodes]
         keys = {own.ends: own for status in instances.values() for own in status.keys}
-        return replace(self, nodes=tuple(nodes), keys=tuple(keys.get(own.ends, own) for own in self.keys))
+        own_keys = tuple(keys.get(own.ends, own) for own in self.keys)
+        return replace(self, nodes=tuple(nodes), keys=own_keys, defects={**defects})
 
     def svg(self) -> str:
         """The picture as the text of an SVG file; needs no library.
@@ -170,7 +178,9 @@ class SystemGraph(msgspec.Struct, frozen=True):
         for name, keys in boxes.items():
             rules, activities = (", ".join(dict.fromkeys(map(attrgetter(of), keys))) for of in ("rule", "activity"))
             nodes[keys[0].direction == "in"].append(GraphNode(name, rules, name, activities or None))
-        return drawing_of(self.title, [*nodes[True], *self.nodes, *nodes[False]], tuple(edges), self.cycles)
+        return drawing_of(
+            self.title, [*nodes[True], *self.nodes, *nodes[False]], tuple(edges), self.cycles, self.defects
+        )
 
     def __repr__(self) -> str:
         return f"<SystemGraph of {self.title}>"

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
+from typing import Final
 
+from ..system.defect import Defect, largest_defects
 from ..text import counted, printable
 
-__all__ = ["escaped", "html_table", "pairs", "shortened", "table", "titled", "wrapped"]
+__all__ = [
+    "DEFECT_COLUMNS",
+    "defect_rows",
+    "escaped",
+    "html_table",
+    "pairs",
+    "shortened",
+    "table",
+    "titled",
+    "wrapped",
+]
+
+DEFECT_COLUMNS: Final = ("connection", "largest", "of its range", "RMS", "at t in s")
 
 _GAP = "  "
 _ELLIPSIS = "\N{HORIZONTAL ELLIPSIS}"
@@ -59,6 +73,14 @@ def wrapped(parts: Sequence[str], width: int, front: str = "") -> list[str]:
 def pairs(items: Iterable[tuple[str, str]], *, indent: int = 0) -> list[str]:
     """The lines of a list of names and values, without the pairs whose value is empty."""
     return table([[name, value] for name, value in items if value], indent=indent)
+
+
+def defect_rows(defects: Mapping[str, Defect]) -> list[tuple[str, ...]]:
+    """The five that are largest relative to the range of their inputs, as rows of `DEFECT_COLUMNS`."""
+    return [
+        (name, f"{own.maximum:.3g}", f"{own.relative:.3g}", f"{own.rms:.3g}", f"{own.time:.12g}")
+        for name, own in largest_defects(defects, 5).items()
+    ]
 
 
 def escaped(text: str) -> str:

@@ -55,13 +55,14 @@ from ..errors import (
     RunReset,
 )
 from ..files import Kept
-from ..results.defects import Defect, DefectWatch
+from ..results.defects import DefectWatch
 from ..results.growth import GrowthWatch
 from ..results.played_rows import MemoryOf, PlayedRows
 from ..results.record_files import RecordFiles
 from ..results.recording import ResultFile
 from ..rings.host_memory import HostMemory, Wish
 from ..simtime import ENDLESS
+from ..system.defect import Defect, largest_defects
 from ..system.live_keys import KeyValue
 from ..system.plan import RECORDER, Link, NodePlan
 from ..variables.value_conversion import MAX_TEXT_SIZE
@@ -111,6 +112,10 @@ _LAST_S = 0.5
 _MOST_KEYS = 8 * MAX_TEXT_SIZE
 """In bytes; JSON has up to six for a character."""
 _FLUSH_S = 0.2
+_DEFECTS_S = 1.0
+"""How often in s, at most, defects are calculated for the status; a hundredth of the time if there are very many."""
+_SHOWN_DEFECTS = 64
+"""Defects in the status, which is published ten times a second."""
 _LOOK_S = 0.1
 """How often in s the end of the recorder is looked at for a write that does not return."""
 
@@ -168,7 +173,8 @@ class Recorder:
         self._files = RecordFiles(files, growth, notes, defects)
         self._wanted, self._on_flush, self._played = wanted, on_flush, played
         self._first = self._written = self._told = plan.grid.first_point
-        self._flushed = 0.0
+        self._flushed = self._defects_due = 0.0
+        self._newest_defects: dict[str, Defect] = {}
         self._finished = False
         self._finish_at: float = math.inf
         self._cause: BaseException | None = None
@@ -194,6 +200,10 @@ class Recorder:
     def defects(self) -> dict[str, Defect]:
         """See `RecordFiles`; complete after the `with` block."""
         return self._files.defects
+
+    def newest_defects(self) -> dict[str, Defect]:
+        """From any thread: the 64 largest of about a second ago, the largest first."""
+        return self._newest_defects
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -322,6 +332,9 @@ class Recorder:
                     self._flushed = now
                     self._note_audit(now)
                     self._files.flush()
+                    if now >= self._defects_due:
+                        self._newest_defects = largest_defects(self._files.defects, _SHOWN_DEFECTS)
+                        self._defects_due = now + max(_DEFECTS_S, 100.0 * (time.monotonic() - now))
                     self._on_flush(self._files.kept)
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:

@@ -11,17 +11,17 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from ..simtime import TimeGrid
-from ..system.coupling_rule import Consistent, lines_through
+from ..system.coupling_rule import Consistent, jumps_in
+from ..system.defect import Defect
 from ..system.feeds import Compared
 from ..system.plan import Plan
 from .growth import ReadColumn
 
-__all__ = ["Defect", "DefectWatch"]
+__all__ = ["DefectWatch"]
 
 _CHUNK: Final = 8192
 """Differences that are added up at once. Sums of floats depend on what is added first, so chunks begin at multiples of
@@ -29,26 +29,6 @@ it, whatever the blocks are in which rows are written."""
 
 _BEFORE: Final = 2
 """Values before a chunk that tell the line at its first one, and whether that one has jumped."""
-
-
-class Defect(msgspec.Struct, frozen=True):
-    """How far what a target assumed was from what came: a pointer to the connection, and no estimate of an error.
-
-    Attributes:
-        maximum: the largest difference, in the unit of the input.
-        point: the point at which the value came that differs most.
-        time: the simulation time of that point in s.
-        rms: root mean square of all differences, in the unit of the input.
-        relative: the largest difference divided by the range of the input in the run; 0 if it was constant.
-        steps: number of differences: the steps of the target in which a value came.
-    """
-
-    maximum: float
-    point: int
-    time: float
-    rms: float
-    relative: float
-    steps: int
 
 
 class DefectWatch:
@@ -59,27 +39,31 @@ class DefectWatch:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._watched: list[_Watched] = []
+        self._watched: dict[Compared, _Watched] = {}  # without names: all readers of an output may assume the same
 
     def begin(self, read_of: Callable[[Consistent], ReadColumn]) -> None:
         """Choose what is read; ``read_of`` says how the values of an input are read that follow from rows."""
-        self._watched = [_Watched(one, read_of(one.value)) for one in self._plan.system.compared]
+        self._watched = {}
+        for one in self._plan.system.compared:
+            if (same := one._replace(name="")) not in self._watched:
+                self._watched[same] = _Watched(one, read_of(one.value))
 
     def begin_again(self) -> None:
         """Another run begins, whose values are read in the same way."""
-        for own in self._watched:
+        for own in self._watched.values():
             own.begin_again()
 
     def look(self, first: int, end: int) -> None:
         """Look at the points first to end - 1."""
-        for own in self._watched:
+        for own in self._watched.values():
             own.take(first, end)
 
     @property
     def defects(self) -> dict[str, Defect]:
         """The defects so far by connection, as `a.y -> b.u`, in the order of the plan; without those of no step."""
-        grid = self._plan.grid
-        return {own.name: found for own in self._watched if (found := own.defect(grid)) is not None}
+        found = {same: own.defect(self._plan.grid) for same, own in self._watched.items()}
+        named = ((one.name, found.get(one._replace(name=""))) for one in self._plan.system.compared)
+        return {name: own for name, own in named if own is not None}
 
 
 class _Sums(NamedTuple):
@@ -108,7 +92,7 @@ class _Watched:
     """One connection. Value n of its source is the n-th that the target gets and did not have before."""
 
     def __init__(self, compared: Compared, read: ReadColumn) -> None:
-        self.name, self._way, self._read = compared.name, compared.way, read
+        self._way, self._read = compared.way, read
         self._own, self._target = own, target = compared.rule.source_points, compared.rule.target_points
         # With a delay of 0, the last value is the one at the end of the step, and the line goes through both ends.
         self._knows_end = not compared.rule.delay and target >= own
@@ -176,7 +160,7 @@ class _Watched:
             return _Sums()
         values, came = self._values[known - self._begin : self._end - self._begin], self._end - low
         with np.errstate(over="ignore", invalid="ignore"):  # values need not be finite
-            sizes = values[1 - came :] - self._assumed(values, known)[1 - came :]
+            sizes = self._differences(values, known)[1 - came :]
             place = int(np.abs(sizes, out=sizes).argmax())
             squares, ends = float(np.add.reduce(sizes * sizes)), values[-came:]
             if not math.isfinite(squares):
@@ -186,24 +170,27 @@ class _Watched:
         least, most = (float(ends.min()), float(ends.max())) if len(ends) else (math.inf, -math.inf)
         return _Sums(came - 1, float(sizes[place]), low + 1 + place, squares, least, most)
 
-    def _assumed(self, values: NDArray[np.float64], known: int) -> NDArray[np.float64]:
-        """What was assumed instead of each of the values but the first one, which has the number ``known``."""
+    def _differences(self, values: NDArray[np.float64], known: int) -> NDArray[np.float64]:
+        """What came minus what was assumed, of each value but the first one, which has the number ``known``."""
         before, came = values[:-1], values[1:]
-        if self._way == "hold":
-            return before
         if self._knows_end and self._way == "linear":
-            return came
-        is_regular, begin, end = self._stride and not self._stride % self._own, known, known + len(values)
-        if is_regular:  # as below, and faster
-            points = np.arange(begin * self._stride, end * self._stride, self._stride, dtype=float)
+            return came - came
+        change = came - before
+        if self._way == "hold":
+            return change
+        if self._stride and not self._stride % self._own:  # as below, and faster
+            line, distance = change[:-1], np.broadcast_to(float(self._stride), change.shape)
         else:
-            rows = self._points(np.arange(begin, end)) // self._own * self._own
-            points = rows.astype(float)
-        change, distance, jumped = lines_through(values, points)
-        if self._knows_end:
-            return np.where(jumped[1:], before, came)
-        assumed = change[:-1] if is_regular else change[:-1] * (np.diff(points) / distance[:-1])
-        assumed += before
+            points = self._points(np.arange(known, known + len(values))) // self._own * self._own
+            distance = np.diff(points).astype(float)
+            line = change[:-1] * (distance[1:] / distance[:-1])
+        assumed = came
+        if not self._knows_end:
+            assumed = before.copy()
+            assumed[1:] += line
+        found = came - assumed
         if self._way == "midpoint":
-            np.copyto(assumed, before, where=jumped[:-1])
-        return assumed
+            jumps = jumps_in(values, change, distance)
+            held = jumps - 1 if self._knows_end else jumps[jumps < len(change)]
+            found[held] = change[held]
+        return found

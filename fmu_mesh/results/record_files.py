@@ -27,11 +27,12 @@ from ..errors import ConfigurationError, DeadlineExceeded
 from ..files import Kept, is_file, open_alone, unwritable
 from ..simtime import TimeGrid
 from ..system.coupling_rule import Consistent
+from ..system.defect import Defect
 from ..system.live_keys import KeyValue
 from ..system.records import IN_MEMORY, RecordPlan, record_paths
 from ..system.run_metadata import metadata_of
 from ..system.system import ResolvedSystem
-from .defects import Defect, DefectWatch
+from .defects import DefectWatch
 from .formats import goes_on, reading, required_format
 from .growth import GrowthWatch, ReadColumn
 from .keys_file import KeysFile, keys_beside

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ..config.findings import Findings
 from ..config.loading import LoadedConfig
 from ..files import Kept, decoded_json
+from ..system.defect import Defect
 from ..variables.model_description import ModelDescription, Variable
 from ..variables.value_types import VariableType
-from .defects import Defect
 
 __all__ = [
     "Columns",

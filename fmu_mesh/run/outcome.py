@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 
 from ..errors import ErrorReport, FmuMeshError
-from ..results.defects import Defect
+from ..system.defect import Defect
 from ..system.plan import Plan
 from ..wire.time_profile import MeshProfile
 

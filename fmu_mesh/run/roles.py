@@ -319,7 +319,7 @@ def run_master(run: RunPlan, emit: Callable[[Event], None]) -> Outcome:
                 if RECORDER in run.plan.nodes:
                     recorder = runs.recorder(master)
                     with recorder:
-                        master.run(recorder.check_writing)
+                        master.run(recorder.check_writing, recorder.newest_defects)
                 else:
                     master.run()
             except FmuMeshError as error:

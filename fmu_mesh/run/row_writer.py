@@ -15,10 +15,11 @@ from collections.abc import Mapping, Sequence
 
 from ..node.stepping import Runner
 from ..recorder.recorded_source import RecordedSource
-from ..results.defects import Defect, DefectWatch
+from ..results.defects import DefectWatch
 from ..results.growth import GrowthWatch
 from ..results.record_files import RecordFiles, what_is_kept
 from ..results.recording import ResultFile
+from ..system.defect import Defect
 from ..system.plan import RECORDER, Plan
 from ..wire.frames import SourceRows
 

@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Consistent", "CouplingRule", "Lines", "SourceLine", "Term", "lines_through"]
+__all__ = ["Consistent", "CouplingRule", "SourceLine", "Term", "jumps_in"]
 
 _JUMP: Final = 4.0
 _PART: Final = 0.1
@@ -96,25 +96,20 @@ class SourceLine(msgspec.Struct, frozen=True):
         return self.value if self.jumped else self.at(begin + 0.5 * points)
 
 
-class Lines(NamedTuple):
-    """Many lines, each with its last value; arrays, as the fields of `SourceLine`."""
+def jumps_in(
+    values: NDArray[np.float64], change: NDArray[np.float64], distance: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """The places of the values at which `SourceLine` says that the source has jumped; the first two never have.
 
-    change: NDArray[np.float64]
-    distance: NDArray[np.float64]
-    jumped: NDArray[np.bool_]
-
-
-def lines_through(values: NDArray[np.float64], points: NDArray[np.float64]) -> Lines:
-    """What `SourceLine.through` gives, one after another, for values at ascending points."""
-    change, distance, jumped = np.zeros_like(values), np.ones_like(points), np.zeros(len(values), bool)
-    np.subtract(values[1:], values[:-1], out=change[1:])
-    np.subtract(points[1:], points[:-1], out=distance[1:])
-    sizes = np.abs(values)
-    large = np.flatnonzero(np.abs(change[1:]) > _PART * np.maximum(sizes[1:], sizes[:-1])) + 1  # few are
+    ``change[n]`` is that from value n to the next one, and ``distance[n]`` the number of points between them.
+    """
+    limits, sizes = np.abs(values), np.abs(change)
+    limits *= _PART
+    large = np.flatnonzero(sizes > limits[1:])  # few are, and of few the rest is calculated
+    large = large[(sizes[large] > limits[large]) & (large > 0)]
     before = change[large - 1] / distance[large - 1]
     is_sudden = np.abs(change[large] / distance[large] - before) > _JUMP * np.abs(before)
-    jumped[large] = is_sudden & (points[large - 1] > 0)
-    return Lines(change, distance, jumped)
+    return large[is_sudden] + 1
 
 
 class Term(NamedTuple):

@@ -11,6 +11,7 @@ from ..config.key_sections import KeyView
 from ..config.ros_section import MeshTopic
 from ..errors import ErrorReport
 from ..simtime import ENDLESS
+from ..system.defect import Defect
 from ..text import counted
 from ..variables.model_description import Clock, DefaultExperiment, PlainValue
 from .runtime import this_host
@@ -354,6 +355,8 @@ class MeshStatus(msgspec.Struct, frozen=True):
         restarts: how often all processes were started again, because one was lost.
         restarting: while it comes back, such as `attempt 2 of 3, from point 812`.
         may_restart: whether it starts again if a process is lost.
+        defects: with `simulation.defects`, by connection, in the rows of about a second ago; the 64 that are largest
+            relative to the range of their inputs, the largest first. Empty in a run in one process.
     """
 
     mesh: str
@@ -373,6 +376,7 @@ class MeshStatus(msgspec.Struct, frozen=True):
     restarts: int = 0
     restarting: str = ""
     may_restart: bool = False
+    defects: dict[str, Defect] = {}
 
 
 class RosTopicView(msgspec.Struct, frozen=True):

@@ -14,6 +14,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
+from fmu_mesh.api.result import Result
 from tests.dashboards import Browser, Dashboard, browser, needs_chromium
 from tests.helpers import Place, wait_until, write_config
 
@@ -94,11 +95,42 @@ def test_the_page_shows_run_from_its_start_and_asks_no_other_host(place: Place) 
         assert "real-time factor" in page.text
         assert "token" not in address
         assert "curve=" in address
+        assert "defects" not in page.text  # which this run does not look at
+        assert page.run(_RINGS) == 0
         assert page.problems() == []
         assert page.hosts() == {"127.0.0.1"}
         page.driver.refresh()
         wait_until(lambda: page.state == "running" and page.curve("pendulum.a"), "the same page again")
     place.run("stop", "pair")
+
+
+_TIP = "return document.querySelector('.fm-graph .edge title')?.textContent ?? ''"
+_RINGS = "return document.querySelectorAll('.fm-graph .ring').length"
+
+
+def test_edges_and_a_table_show_defects_in_both_themes(place: Place) -> None:
+    config = write_config(place.folder, stop_time=12.0, simulation={**PACED, "defects": True})
+    dashboard = Dashboard(place)
+
+    with browser(place.folder) as page:
+        page.driver.get(dashboard.url)
+        run = place.start("launch", config, "--no-progress")
+        wait_until(lambda: page.state == "running", "the mesh on the page")
+        wait_until(lambda: "\nassumed and came differ by at most " in page.run(_TIP), "the defect of the edge")
+        assert "Largest defects: a pointer to the connection, no error estimate" in page.text
+        assert page.run(_RINGS) == 1
+        shown = _status(place, "pair")["defects"]["pendulum.a -> delay.x"]
+        assert 0.0 < shown["rms"] < shown["maximum"]
+        for theme, least, most in (("light", 200.0, 255.0), ("dark", 0.0, 80.0)):
+            page.show_as(theme, 1280, 800)
+            wait_until(lambda: least <= _mean(page.picture(".fm-defects")) <= most, f"the {theme} theme")  # noqa: B023  called now
+
+        assert run.wait() == 0
+        last = Result.read(place.folder / "pair.csv").defects["pendulum.a -> delay.x"]
+        text = f"by at most {last.maximum:.3g} (at t = {last.time:.12g} s), RMS {last.rms:.3g}"
+        wait_until(lambda: text in page.run(_TIP), "the defect in the result file")
+        assert f"{last.rms:.3g}" in page.text
+        assert page.problems() == []
 
 
 def test_no_line_is_drawn_over_the_time_in_which_nobody_looked(place: Place) -> None:

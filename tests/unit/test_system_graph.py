@@ -18,6 +18,7 @@ from fmu_mesh.pictures.drawing import CYCLE_COLOURS
 from fmu_mesh.pictures.graph_drawing import Box, Drawing, GraphEdge, GraphNode, GraphVariable, drawing_of
 from fmu_mesh.pictures.graph_layout import Wire, arranged
 from fmu_mesh.pictures.system_graph import SystemGraph, graph_of
+from fmu_mesh.system.defect import Defect
 from fmu_mesh.wire.views import InstanceStatus, KeyStatus
 from tests.helpers import FMUS, Place
 
@@ -115,6 +116,40 @@ def test_a_group_has_its_instances_inside_and_all_others_outside(graph: SystemGr
                 assert is_inside(place[node.instance], group)
             else:
                 assert not overlap(place[node.instance], group)
+
+
+def defect(maximum: float, relative: float) -> Defect:
+    return Defect(maximum, 3, 0.25, 0.5 * maximum, relative, 10)
+
+
+def test_wires_say_their_defects_and_largest_has_a_ring() -> None:
+    single, many = GraphVariable("y", "u", "m", "m"), [GraphVariable(f"y{n}", f"u{n}") for n in range(5)]
+    array = GraphVariable("z", "w", "s", "s")
+    connections = [(("a", "b", 0), single), (("b", "c", 1), array), *((("a", "c", 0), own) for own in many)]
+    graph = graph_of("differs", [GraphNode(name, "M.fmu", name) for name in "abc"], connections)
+    found = {
+        "a.y -> b.u": defect(0.5, 0.01),
+        "b.z[1,2] -> c.w[2]": defect(2.0, 0.3),
+        "b.z[2,1] -> c.w[3]": defect(4.0, 0.2),
+        "a.y3 -> c.u3": defect(1.0, 0.1),
+        "other.y -> c.u": defect(9.0, 0.25),
+    }
+
+    picture = ET.fromstring(graph.with_status({}, defects=found).svg())  # noqa: S314  it was written here
+    bare = graph.svg()
+
+    wires = {own.get("data-source", "") + own.get("data-target", ""): own for own in picture.iter(f"{SVG}g")}
+    last = {name: "".join(own.itertext()).splitlines()[-1] for name, own in wires.items() if len(name) == 2}
+    assert last == {
+        "ab": "assumed and came differ by at most 0.5 m (at t = 0.25 s), RMS 0.25 m",
+        "bc": "b.z[1,2] -> c.w[2]: assumed and came differ by at most 2 s (at t = 0.25 s), RMS 1 s",
+        "ac": "a.y3 -> c.u3: assumed and came differ by at most 1 (at t = 0.25 s), RMS 0.5",
+    }
+    assert [name for name, own in wires.items() if len(name) == 2 and own.find(f".//{SVG}circle") is not None] == ["bc"]
+    assert "ring: " in "".join(picture.itertext())
+    assert "assumed" not in bare
+    assert "ring: " not in bare
+    assert graph.with_status({}, defects=found).figure().axes[0].patches
 
 
 def test_every_connection_is_a_wire_from_its_source_to_its_target(graph: SystemGraph) -> None:

@@ -7,7 +7,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property, partial
-from heapq import nlargest
 from typing import TYPE_CHECKING, Final, Self
 
 from ...api.result import summary_of
@@ -15,7 +14,7 @@ from ...config.access_sections import is_socket
 from ...config.deploy_section import HostConfig
 from ...errors import from_report
 from ...pictures.plan_page import slower_than_it_could_be
-from ...pictures.tables import table
+from ...pictures.tables import DEFECT_COLUMNS, defect_rows, table
 from ...printing import paragraph, printable
 from ...run.events import Event, Log, OutputLine, Reachable, Restarted, Status, WasReset
 from ...run.outcome import Outcome
@@ -220,20 +219,12 @@ def warn(plan: Plan) -> None:
         say_warning(f"and {rest} more, which `fmu-mesh check` shows")
 
 
-_MOST_DEFECTS: Final = 5
-_DEFECTS: Final = ("connection", "largest", "of its range", "RMS", "at t in s")
-
-
 def summary(plan: Plan, outcome: Outcome) -> list[str]:
     """The closing lines of a run; the last one is `20000 points in 1.234 s: 16207 points/s, real-time factor 32.4`."""
     lines = [f"result: {short_path(file)} ({rows} rows)" for file, rows in outcome.files]
     lines += [f"warning: {warning}" for warning in outcome.warnings]
-    if outcome.defects:
-        largest = nlargest(_MOST_DEFECTS, outcome.defects.items(), key=lambda item: item[1].relative)
-        rows = [
-            (name, f"{own.maximum:.3g}", f"{own.relative:.3g}", f"{own.rms:.3g}", f"{own.time:.12g}")
-            for name, own in largest
-        ]
-        lines += ["defects: a pointer to the connection, no error estimate", *table(rows, heading=_DEFECTS, indent=2)]
+    if rows := defect_rows(outcome.defects):
+        title = "defects: a pointer to the connection, no error estimate"
+        lines += [title, *table(rows, heading=DEFECT_COLUMNS, indent=2)]
     lines.append(summary_of(outcome, plan.grid.step_size))
     return lines

@@ -13,11 +13,11 @@ import msgspec
 from msgspec.structs import replace
 
 from ...errors import ErrorReport, FmuMeshError
-from ...results.defects import Defect
 from ...run.events import Event, Restarted, WasReset
 from ...run.outcome import Outcome
 from ...run.overriding import memory_of
 from ...run.run_plan import RunPlan
+from ...system.defect import Defect
 from .json_output import Failure, failure_of, print_json
 from .terminal import stdout_as_stderr
 
