@@ -216,8 +216,9 @@ class Copies:
         What an FMU raises is in `errors`, and ends its copy.
         """
         wanted = wanted & ~self._ended
-        points = self._node.instance(instance).step_points
-        np.copyto(self._set_at[instance], self.points // points, where=wanted)
+        own = self._node.instance(instance)
+        done = (self.points + own.step_points - 1 - own.wait_points) // own.step_points
+        np.copyto(self._set_at[instance], np.minimum(done, self._last // own.step_points), where=wanted)
         self._is_set.add(instance)
         variable = self._plan.system.instances[instance].description.variable(name)
         shape = variable.shape if variable is not None else ()
