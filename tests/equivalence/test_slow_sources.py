@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -85,6 +85,53 @@ def test_interpolated_inputs_are_the_same_in_every_way(groups: str, tmp_path: Pa
     for way in WAYS if groups == "alone" else WAYS[1:4]:
         mesh.run(output=output, **way)
         assert output.read_bytes() == expected, way
+
+
+def test_interpolated_inputs_are_the_same_without_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, output = written(slow_sources({}), tmp_path), tmp_path / "other.csv"
+    expected = in_one_process(config)
+    monkeypatch.setattr("fmu_mesh.rings.native.library", None)
+    mesh = fmu_mesh.load(config)
+
+    result = mesh.run(output=output, processes=False)
+    batch = mesh.batch(1)
+    batch.step(51)
+
+    assert output.read_bytes() == expected
+    assert [batch.get(name)[0] for name in ("gain.y", "two.y")] == [result[name][51] for name in ("gain.y", "two.y")]
+
+
+def test_linear_inputs_of_model_exchange_follow_both_ends(event_fmu: Callable[..., Path], tmp_path: Path) -> None:
+    content = slow_sources({}, extrapolation="auto")
+    content["instances"]["model"] = {
+        "fmu": str(event_fmu("Oscillator", 2)),
+        "kind": "model_exchange",
+        "solver": {"name": "dopri5"},
+    }
+    content["connections"] += ["gain.y -> model.u"]
+    config, output = written(content, tmp_path), tmp_path / "other.csv"
+    expected = in_one_process(config)
+    mesh = fmu_mesh.load(config)
+    assert [c.extrapolation for c in mesh.plan().plan.connections if c.ahead][-1] == "linear"
+
+    for way in [{"processes": False}, {"window": 1}, {}]:
+        mesh.run(output=output, **way)
+        assert output.read_bytes() == expected, way
+
+
+def test_pauses_and_single_steps_change_nothing(tmp_path: Path) -> None:
+    config = written(slow_sources({}), tmp_path)
+    expected = in_one_process(config)
+
+    with fmu_mesh.load(config).start(output=tmp_path / "other.csv", paused=True) as run:
+        run.wait_for("paused")
+        for points in (1, 2, 3, 1, 7, 10):
+            run.step(points)
+        assert run.checkpoint(tmp_path / "at.state") == 24
+        run.resume()
+        run.wait()
+
+    assert (tmp_path / "other.csv").read_bytes() == expected
 
 
 def test_copies_and_a_program_that_steps_see_the_same_values(tmp_path: Path) -> None:
