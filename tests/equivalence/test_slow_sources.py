@@ -10,46 +10,9 @@ import pytest
 import yaml
 
 import fmu_mesh
+from tests.all_systems import SLOW_POINTS, slow_sources
+from tests.equivalence.test_equivalence import H
 from tests.equivalence.test_every_way import in_one_process
-from tests.helpers import FMUS
-
-H: Final = 0.0078125
-POINTS: Final = 203
-"""Neither 8 nor 4 nor 3 nor 2 divides it."""
-
-
-def slow_sources(groups: Mapping[str, str], **simulation: object) -> dict[str, Any]:
-    """A chain of 8, 4 and 1 points, a cycle of 4 and 1 points, and 3 points for 2; values change within slow steps."""
-    members: dict[str, tuple[str, dict[str, float], int]] = {
-        "sum": ("Adder", {}, 1),
-        "both": ("Adder", {}, 1),
-        "two": ("Integrator", {"k": 0.8}, 2),
-        "three": ("Integrator", {"k": 1.5, "y": 0.2}, 3),
-        "back": ("Integrator", {"k": -2.0}, 4),
-        "gain": ("Gain", {"k": 0.7}, 4),
-        "pendulum": ("DampedPendulum", {"a": 1.3}, 8),
-    }
-    return {
-        "mesh": "system",
-        "simulation": {"stop_time": POINTS * H, "step_size": H, "extrapolation": "midpoint"} | simulation,
-        "instances": {
-            name: {"fmu": str(FMUS / f"{fmu}.fmu"), "start_values": start_values, "step_size": points * H}
-            | ({"group": groups[name]} if name in groups else {})
-            for name, (fmu, start_values, points) in members.items()
-        },
-        "connections": [
-            "pendulum.a -> gain.u",
-            "gain.y -> sum.u1",
-            "back.y -> sum.u2",
-            {"from": "sum.y", "to": "back.u", "delay": 1},
-            {"from": "gain.y", "to": "both.u1", "extrapolation": "hold"},
-            {"from": "gain.y", "to": "both.u2", "factor": 2.0},
-            {"from": "sum.y", "to": "three.u", "delay": 1},
-            "three.y -> two.u",
-        ],
-        "scenario": {"events": [{"at": 50 * H, "set": {"gain.k": 0.9}}, {"at": 101 * H, "set": {"three.k": -1.0}}]},
-        "record": {"file": "system.csv"},
-    }
 
 
 def written(content: Mapping[str, Any], folder: Path) -> Path:
@@ -72,6 +35,7 @@ WAYS: Final[list[dict[str, Any]]] = [
     {"config_values": {"zenoh.shared_memory": False}, "window": 1},
     {"config_values": {"zenoh.shared_memory": False, "zenoh.row_streams": False}},
 ]
+FEW: Final[list[dict[str, Any]]] = [{"processes": False}, {"window": 1}, {}]
 
 
 @pytest.mark.parametrize("groups", GROUPS)
@@ -88,7 +52,7 @@ def test_interpolated_inputs_are_the_same_in_every_way(groups: str, tmp_path: Pa
 
 
 def test_interpolated_inputs_are_the_same_without_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config, output = written(slow_sources({}), tmp_path), tmp_path / "other.csv"
+    config, output = written(slow_sources(), tmp_path), tmp_path / "other.csv"
     expected = in_one_process(config)
     monkeypatch.setattr("fmu_mesh.rings.native.library", None)
     mesh = fmu_mesh.load(config)
@@ -102,7 +66,7 @@ def test_interpolated_inputs_are_the_same_without_the_library(tmp_path: Path, mo
 
 
 def test_linear_inputs_of_model_exchange_follow_both_ends(event_fmu: Callable[..., Path], tmp_path: Path) -> None:
-    content = slow_sources({}, extrapolation="auto")
+    content = slow_sources(extrapolation="auto")
     content["instances"]["model"] = {
         "fmu": str(event_fmu("Oscillator", 2)),
         "kind": "model_exchange",
@@ -114,13 +78,13 @@ def test_linear_inputs_of_model_exchange_follow_both_ends(event_fmu: Callable[..
     mesh = fmu_mesh.load(config)
     assert [c.extrapolation for c in mesh.plan().plan.connections if c.ahead][-1] == "linear"
 
-    for way in [{"processes": False}, {"window": 1}, {}]:
+    for way in FEW:
         mesh.run(output=output, **way)
         assert output.read_bytes() == expected, way
 
 
 def test_pauses_and_single_steps_change_nothing(tmp_path: Path) -> None:
-    config = written(slow_sources({}), tmp_path)
+    config = written(slow_sources(), tmp_path)
     expected = in_one_process(config)
 
     with fmu_mesh.load(config).start(output=tmp_path / "other.csv", paused=True) as run:
@@ -135,13 +99,13 @@ def test_pauses_and_single_steps_change_nothing(tmp_path: Path) -> None:
 
 
 def test_copies_and_a_program_that_steps_see_the_same_values(tmp_path: Path) -> None:
-    mesh = fmu_mesh.load(written(slow_sources({}), tmp_path))
+    mesh = fmu_mesh.load(written(slow_sources(), tmp_path))
     expected = mesh.run(processes=False, record="memory")
     names = ["sum.y", "both.y", "two.y", "three.y", "back.y", "gain.y", "pendulum.a"]
 
     batch = mesh.batch(2)
     with mesh.open() as system:
-        for point in range(POINTS + 1):
+        for point in range(SLOW_POINTS + 1):
             row = [expected[name][point] for name in names]
             assert [system.get(name) for name in names] == row, point
             assert [batch.get(name)[1] for name in names] == row, point
@@ -151,27 +115,27 @@ def test_copies_and_a_program_that_steps_see_the_same_values(tmp_path: Path) -> 
                 system.step(5)
                 batch.restore(saved[0])
                 system.restore(saved[1])
-            if point < POINTS:
+            if point < SLOW_POINTS:
                 batch.step()
                 system.step()
 
 
 def test_a_run_that_begins_with_a_state_goes_on_between_both_ends(tmp_path: Path) -> None:
-    mesh = fmu_mesh.load(written(slow_sources({}), tmp_path))
+    mesh = fmu_mesh.load(written(slow_sources(), tmp_path))
     whole = mesh.run(processes=False, record="memory")
     with mesh.open() as system:
         system.step(96)
         system.save(tmp_path / "at.state")
 
-    for way in ({"processes": False}, {"window": 1}):
+    for way in FEW[:2]:
         rest = mesh.run(state=tmp_path / "at.state", output=tmp_path / "rest.csv", **way)
 
         for name in ("sum.y", "both.y", "two.y", "pendulum.a"):
             assert rest[name].tolist() == whole[name][96:].tolist(), (name, way)
 
 
-def test_a_value_that_is_set_within_a_step_is_for_the_next_one(tmp_path: Path) -> None:
-    content = slow_sources({})
+def test_a_value_that_is_set_within_a_step_waits_for_the_next(tmp_path: Path) -> None:
+    content = slow_sources()
     expected = fmu_mesh.load(written(content, tmp_path)).run(processes=False, record="memory")
     del content["scenario"]
     mesh = fmu_mesh.load(written(content, tmp_path))
@@ -179,14 +143,14 @@ def test_a_value_that_is_set_within_a_step_is_for_the_next_one(tmp_path: Path) -
 
     batch = mesh.batch(2)
     with mesh.open() as system:
-        for point in range(POINTS + 1):
+        for point in range(SLOW_POINTS + 1):
             for name, value in {50: {"gain.k": 0.9}, 101: {"three.k": -1.0}}.get(point, {}).items():
                 system.set(name, value)
                 batch.set(name, [value, value])
             row = [expected[name][point] for name in names]
             assert [system.get(name) for name in names] == row, point
             assert [batch.get(name)[1] for name in names] == row, point
-            if point < POINTS:
+            if point < SLOW_POINTS:
                 batch.step()
                 system.step()
 
@@ -212,16 +176,16 @@ class Ending(fmu_mesh.Component):
 
 
 @pytest.mark.parametrize("asks", [True, False], ids=["asks to end", "not finite"])
-def test_a_source_that_ends_the_run_ends_it_at_the_start_of_its_step(*, asks: bool, tmp_path: Path) -> None:
+def test_a_source_that_ends_a_run_does_so_before_its_step(*, asks: bool, tmp_path: Path) -> None:
     """Its targets wait for the end of this step, so they come no further."""
     (tmp_path / "parts.py").write_text(ENDING, encoding="utf-8")
-    content = slow_sources({}) | {"connections": ["ending.y -> both.u1", "both.y -> two.u"], "scenario": {}}
+    content = slow_sources() | {"connections": ["ending.y -> both.u1", "both.y -> two.u"], "scenario": {}}
     ending = {"python": "parts.py:Ending", "step_size": 4 * H, "start_values": {"asks": asks}}
     content["instances"] = {name: content["instances"][name] for name in ("both", "two")} | {"ending": ending}
     mesh = fmu_mesh.load(written(content, tmp_path))
     ends = []
 
-    for number, way in enumerate([{"processes": False}, {"window": 1}, {}]):
+    for number, way in enumerate(FEW):
         output = tmp_path / f"{number}.csv"
         if asks:
             mesh.run(output=output, **way)

@@ -117,7 +117,7 @@ SLOW: Final = {
 
 
 @pytest.mark.parametrize("way", SLOW)
-def test_a_line_between_both_ends_of_a_slow_source_is_of_order_2(way: str, tmp_path: Path) -> None:
+def test_a_line_between_both_ends_of_slow_steps_is_of_order_2(way: str, tmp_path: Path) -> None:
     (tmp_path / "wave.py").write_text(WAVE, encoding="utf-8")
     errors = []
     for size in (0.04, 0.1, 0.2):

@@ -182,7 +182,7 @@ def traced(*connections: str, points: int, **steps: int) -> str:
     return system.in_one_loop()
 
 
-def test_a_line_of_a_slow_source_goes_to_the_end_of_its_step() -> None:
+def test_a_line_of_a_slow_source_ends_with_its_step() -> None:
     """The source goes ahead; behind its last step, the line goes on."""
     assert (
         traced("slow -> fast", points=7, slow=3)
@@ -237,7 +237,7 @@ b: 6 -> 8 uses a@6
     )
 
 
-def test_a_slow_source_with_a_fast_or_uneven_one_does_not_go_ahead() -> None:
+def test_a_slow_source_behind_a_fast_one_does_not_go_ahead() -> None:
     """It waits for values from the end of its own step, and its targets extrapolate."""
     assert "b: 0 -> 1 uses slow@0" in traced("a -> slow", "slow -> b", points=6, slow=3)
     assert "b: 0 -> 1 uses slow@0" in traced("a -> slow", "slow -> b", points=12, a=3, slow=2)
