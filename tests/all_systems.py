@@ -10,6 +10,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import pytest
@@ -22,11 +23,14 @@ from tests.fmus.event_fmus import Version, build_event_fmu
 from tests.fmus.helpers import NO_COMPILER, session_folder
 from tests.helpers import FMUS
 
-__all__ = ["FEATURES", "SYSTEMS", "consistent_loop", "written_system"]
+__all__ = ["FEATURES", "SLOW_POINTS", "SYSTEMS", "consistent_loop", "slow_sources", "written_system"]
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 POINTS: Final = 2000
 """More than an example of this many points takes too long; in all of them, something happens before."""
+
+SLOW_POINTS: Final = 203
+"""Points of `slow_sources`: neither 8 nor 4 nor 3 nor 2 divides it."""
 
 EXAMPLES: Final = {
     path.stem: path
@@ -111,6 +115,41 @@ def consistent_loop(gain: float = -2.0, **simulation: object) -> dict[str, Any]:
     }
 
 
+def slow_sources(groups: Mapping[str, str] = MappingProxyType({}), **simulation: object) -> dict[str, Any]:
+    """A chain of 8, 4 and 1 points, a cycle of 4 and 1 points, and 3 points for 2; values change within slow steps."""
+    h = rates.H
+    members: dict[str, tuple[str, dict[str, float], int]] = {
+        "sum": ("Adder", {}, 1),
+        "both": ("Adder", {}, 1),
+        "two": ("Integrator", {"k": 0.8}, 2),
+        "three": ("Integrator", {"k": 1.5, "y": 0.2}, 3),
+        "back": ("Integrator", {"k": -2.0}, 4),
+        "gain": ("Gain", {"k": 0.7}, 4),
+        "pendulum": ("DampedPendulum", {"a": 1.3}, 8),
+    }
+    return {
+        "mesh": "system",
+        "simulation": {"stop_time": SLOW_POINTS * h, "step_size": h, "extrapolation": "midpoint"} | simulation,
+        "instances": {
+            name: {"fmu": str(FMUS / f"{fmu}.fmu"), "start_values": start_values, "step_size": points * h}
+            | ({"group": groups[name]} if name in groups else {})
+            for name, (fmu, start_values, points) in members.items()
+        },
+        "connections": [
+            "pendulum.a -> gain.u",
+            "gain.y -> sum.u1",
+            "back.y -> sum.u2",
+            {"from": "sum.y", "to": "back.u", "delay": 1},
+            {"from": "gain.y", "to": "both.u1", "extrapolation": "hold"},
+            {"from": "gain.y", "to": "both.u2", "factor": 2.0},
+            {"from": "sum.y", "to": "three.u", "delay": 1},
+            "three.y -> two.u",
+        ],
+        "scenario": {"events": [{"at": 50 * h, "set": {"gain.k": 0.9}}, {"at": 101 * h, "set": {"three.k": -1.0}}]},
+        "record": {"file": "system.csv"},
+    }
+
+
 def _told(folder: Path) -> dict[str, Any]:
     (folder / "parts.py").write_text(_PARTS, encoding="utf-8")
     return {
@@ -157,6 +196,7 @@ FEATURES: Final[Mapping[str, Callable[[Path], dict[str, Any]]]] = {
     "groups": _grouped,
     "consistent": lambda _: consistent_loop(),
     "rates": lambda _: rates.multi_rate(rates.GAUSS_SEIDEL, rates.MIXED, rates.H),
+    "slow sources": lambda _: slow_sources(),
     "events": _events,
     "types": lambda folder: yaml.safe_load(types.written(folder).read_text(encoding="utf-8")),
 }

@@ -218,7 +218,8 @@ class System:
     def set(self, name: str, value: object) -> None:
         """Set an unconnected input or a tunable parameter. It holds from the next step on.
 
-        A slower instance uses it in the step that is not complete yet, as it uses an input with a delay of 0.
+        A slower instance uses it in the step that is not complete yet, as it uses an input with a delay of 0; one whose
+        target interpolates has taken this step already (docs/coupling.md), and uses it in the next one.
 
         Example:
             >>> mesh = fmu_mesh.Mesh("m", step_size=0.1, stop_time=1.0)

@@ -58,7 +58,8 @@ class MidpointInputs(AroundNativeSteps):
         if not self._points:  # before the first step, the instance has the inputs of Initialization Mode
             self._put([SourceLine(cast("float", value)) for value in self._instance.get_values(names)])
         for line, item, column in zip(self._lines, self._inputs, self._columns, strict=True):
-            line.note(to=row.ctypes.data + 8 * column, delay=item.delay, source_points=item.source_points)
+            rule, to = item.rule, row.ctypes.data + 8 * column
+            line.note(to=to, lead=rule.lead, source_points=rule.source_points, last=rule.last)
         self._points = points
         super().bind(inputs, outputs, grid, points, step)
 
@@ -66,8 +67,7 @@ class MidpointInputs(AroundNativeSteps):
         """See `Instance`."""
         row, lines, begin = self._row.part("Float64")[step & self._row.mask], self._known, step * self._points
         for number, (item, column) in enumerate(zip(self._inputs, self._columns, strict=True)):
-            latest = item.latest(begin, self._points)
-            lines[number] = line = lines[number].through(float(row[column]), latest)
+            lines[number] = line = lines[number].through(float(row[column]), item.latest(step))
             row[column] = line.middle(begin, self._points)
         self._put(lines)
         self._instance.do_step(step)

@@ -156,9 +156,9 @@ class TightMember(AroundInstance[Instance]):
             own[0] = part[slot]
         self._ends, self._goes_on = [], True
         for number, item in enumerate(self._outside):
-            before, latest = self._lines[number], item.latest(begin, self._points)
+            before = self._lines[number]
             value = float(self._floats[self._columns[item.name]])
-            line = self._lines[number] = before.through(value, latest)
+            line = self._lines[number] = before.through(value, item.latest(step))
             start, end = line.at(begin), line.at(begin + self._points)
             is_line = item.name in self._lined or not line.jumped
             self._ends.append((start, end) if is_line else (value, value))

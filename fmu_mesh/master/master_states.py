@@ -200,6 +200,8 @@ class MasterStates:
         if isinstance(error, TerminationRequested) or (isinstance(error, NotFinite) and error.point):
             # Its node continues with its other instances, and reports again at the end.
             last = error.last_point
+            if last is not None and error.instance in self.plan.ahead:  # others lack its next row, and stay before it
+                last -= last % self.plan.system.instances[error.instance].step_points
             if last is None or not granting.may_be_at(node, last):
                 self.fail(granting.broken(node, f"has an FMU that ends the simulation at point {last}"))
             elif last < granting.last_point:

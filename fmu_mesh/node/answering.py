@@ -423,7 +423,7 @@ def instance_info(plan: NodePlan, runner: Runner, ways: Ways | None, loops: Sequ
             ConnectionView(
                 f"{feed.source}.{own.source}",
                 f"{runner.name}.{own.target}",
-                feed.delay,
+                feed.rule.delay,
                 own.factor,
                 own.offset,
                 own.map,

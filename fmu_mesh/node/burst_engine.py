@@ -219,6 +219,7 @@ class BurstEngine(Engine):
             step_size=points * grid.step_size,
             points=points,
             every=points // self.tick_points(unit),
+            wait=runner.plan.wait_points,  # of a unit of one instance, each tick has a step
             last_step=runner.last_step,
             python_at=NEVER,
             outputs=(native.OutputTable * 2)(*rings),

@@ -297,7 +297,7 @@ class PlainEngine(Engine):
                         break
                 for index in range(place.next, len(unit)):
                     place.next, runner = index, unit[index]
-                    if (place.tick + 1) % (runner.plan.step_points // place.tick_points):
+                    if len(unit) > 1 and not runner.has_step(place.tick):
                         continue
                     if any(runner.lacking):
                         return stepped

@@ -422,7 +422,7 @@ class Node:
         runner = self._runners[asked.instance or ""]
         # The master has to know it before the progress of this node, which is beyond the grant then.
         if isinstance(asked, TerminationRequested):
-            asked.at(runner.covered, self._plan.grid.time(runner.covered))
+            asked.at(last := runner.reached_by_all, self._plan.grid.time(last))
         self._tell_end(asked, self._plan.timeouts.stop)
         for member in next(unit for unit in engine.units if runner in unit):
             member.stop()

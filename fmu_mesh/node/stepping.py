@@ -54,6 +54,7 @@ class Source(NamedTuple):
             mask=ring.mask,
             lead=rule.lead,
             points=rule.source_points,
+            last=rule.last,
         )
 
 
@@ -320,6 +321,15 @@ class Runner:
         return min((step + 1) * self.plan.step_points - 1, self.grid.last_point)
 
     @property
+    def reached_by_all(self) -> int:
+        """The last point that all instances can reach if it takes no more steps."""
+        return self.point if self.plan.ahead else self.covered
+
+    def has_step(self, point: int) -> bool:
+        """Where all step point by point: whether it takes its next step before the next point."""
+        return self.point + self.plan.wait_points <= point and self.step < self.last_step
+
+    @property
     def lacking(self) -> Iterator[Source]:
         """The sources without the row for the next step; what is played needs none."""
         step = self.step
@@ -372,9 +382,8 @@ def connect(
         rows.setdefault(link.source, []).extend(found)
         if receiver is not None:
             receivers[link.index] = receiver
-    points = {name: place.step_points for name, place in places.items()}
     for runner in runners.values():
-        runner.sources.extend(sources_of(runner, rows, points))
+        runner.sources.extend(sources_of(runner, rows))
     solve_together(plan.groups, {name: runner.instance for name, runner in runners.items()})
     for group in plan.groups:
         first, *others = (runners[name] for name in group.members)
@@ -382,21 +391,11 @@ def connect(
     return Connected(receivers, streamed)
 
 
-def sources_of(
-    runner: Runner, rows: Mapping[str, Sequence[SourceRows]], step_points: Mapping[str, int]
-) -> Iterator[Source]:
-    """The sources of a runner, from the rows and the base points per own step of each instance."""
+def sources_of(runner: Runner, rows: Mapping[str, Sequence[SourceRows]]) -> Iterator[Source]:
+    """The sources of a runner, from the rows of each instance."""
     for feed in runner.plan.step_feeds:
         for ring, counter, text in rows[feed.source]:
-            transfer = Transfer(
-                feed,
-                ring,
-                runner.inputs,
-                target=runner.name,
-                source_points=step_points[feed.source],
-                target_points=runner.plan.step_points,
-                text=text,
-            )
+            transfer = Transfer(feed, ring, runner.inputs, target=runner.name, text=text)
             if transfer.columns:
                 yield Source(feed.source, transfer, counter)
 

@@ -155,6 +155,9 @@ def _coupling(plan: Plan) -> list[str]:
     if ways and direct:
         names = listed([f"{c.source_instance}.{c.source_name}" for c in direct])
         lines.append(f"  order 1 behind {names}, which depend directly on inputs, without `loops: solved`")
+    rules = [(c, plan.rule_of(c)) for c, _ in ways]
+    if late := [str(c) for c, own in rules if own.source_points > own.target_points and not (own.delay or own.ahead)]:
+        lines.append(f"  extrapolated, because the slower source waits for inputs with delay 0: {listed(late)}")
     if plan.consistent:
         lines.append(f"  consistent at each point: {listed(['.'.join(own) for own in plan.consistent])}")
     return lines

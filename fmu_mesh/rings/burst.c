@@ -231,14 +231,20 @@ static const double JUMP = 4.0, PART = 0.1;
 
 static inline double size_of(double value) { return __builtin_fabs(value); }
 
+/* The row of a source at a point, or its last one: as `CouplingRule` of system/coupling_rule.py. */
+static inline int64_t row_at(int64_t point, int64_t points, int64_t last) {
+  if (points == 1) return point;
+  const int64_t row = point / points;
+  return row < last ? row : last;
+}
+
 /* Inputs get the middle of the lines of their sources in own step `step`: as `SourceLine` of system/coupling_rule.py. */
 static void follow_lines(Member *member, int64_t step) {
   const int64_t begin = step * member->points;
   for (int64_t i = 0; i < member->lines_count; i++) {
     Line *line = &member->lines[i];
     const double value = *line->to;
-    int64_t latest = line->delay ? begin : begin + member->points;
-    latest -= latest % line->source_points;
+    const int64_t latest = row_at(begin + line->lead, line->source_points, line->last) * line->source_points;
     if (latest != line->point) {
       const double change = value - line->value, before = line->change / (double)line->distance;
       const int64_t distance = latest - line->point;
@@ -514,8 +520,7 @@ enum { READY, NOT_READY, NOT_TRUE };
 
 /* The row that the next step of a member needs. */
 static inline int64_t row_of(const Member *member, const Gate *gate) {
-  const int64_t row = member->step * member->points + gate->lead;
-  return gate->points != 1 ? row / gate->points : row;
+  return row_at(member->step * member->points + gate->lead, gate->points, gate->last);
 }
 
 /* Whether the rows of all gates are there; then the bases point to them. */
@@ -565,7 +570,9 @@ static int advance(Node *node, Unit *unit, int64_t *ticks) {
     if (node->streams != NULL && unit->burst <= LONG_STEPS) streams_write(node->streams, 0);
     for (; unit->next < unit->n_members; unit->next++) {
       Member *member = &unit->members[unit->next];
-      if (member->every != 1 && (unit->tick + 1) % member->every != 0) continue;
+      if (member->every != 1 &&
+          (unit->tick < member->step * member->every + member->wait || member->step >= member->last_step))
+        continue;
       if (member->stage != STEPPED) {
         int state = open_gates(node, unit, member);
         if (state == NOT_READY) goto out;

@@ -30,12 +30,13 @@ enum RowBase { FIXED, OUTPUT, WATCHED, FIRST_GATE };                       /* wh
 enum Change { UNCHANGED, SCALED, LOOKED_UP, ADDED };                       /* Move.change */
 enum NumberType { F64, F32, I8, U8, I16, U16, I32, U32, I64, U64, TRUTH }; /* Move.from_type, Move.to_type, Span.type */
 
-typedef struct { /* the rows of one source, for one delay */
+typedef struct { /* the rows of one source, for one rule */
   Counter *counter;
   const char *rows;
   int64_t stride, mask;
   int64_t lead;   /* see system/coupling_rule.py */
   int64_t points; /* base points per step of the source */
+  int64_t last;   /* its last row */
   int64_t known;  /* the counter when it was last read */
 } Gate;
 
@@ -94,7 +95,7 @@ typedef struct { /* an input with a value for each own step that the burst takes
 
 typedef struct { /* an input that gets the middle of the line of its source: see `SourceLine` in system/coupling_rule.py */
   double *to; /* in the row of inputs, where its value is */
-  int64_t delay, source_points;
+  int64_t lead, source_points, last; /* as in Gate */
   double value, change;
   int64_t point, distance, jumped;
 } Line;
@@ -113,6 +114,7 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   double start_time, base_step_size, step_size;
   int64_t points; /* base points per own step */
   int64_t every;  /* ticks of the unit per own step */
+  int64_t wait;   /* ticks from the first one of an own step to that in which it is taken; see steps_ahead */
   int64_t last_step;
   int64_t python_at; /* the first own step that Python takes, whatever its kind */
   Track *tracks;

@@ -191,7 +191,7 @@ class Wish(Structure):
 
 @declared("Gate")
 class Gate(Changed):
-    """The rows of one source, for one delay."""
+    """The rows of one source, for one rule."""
 
 
 @declared("Entry")

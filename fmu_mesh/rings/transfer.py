@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.coupling_rule import CouplingRule
 from ..system.feeds import Feed, FeedColumn
 from ..variables.value_types import is_text
 from .native import NUMBER_TYPES, Change, Lookup, Move, RowBase
@@ -42,20 +41,10 @@ class Transfer:
     The ``rule`` says which row of the source a step needs.
     """
 
-    def __init__(  # noqa: PLR0913  the two ends of a connection
-        self,
-        feed: Feed,
-        source: Ring,
-        inputs: Ring,
-        *,
-        target: str,
-        source_points: int,
-        target_points: int,
-        text: bool | None = None,
-    ) -> None:
+    def __init__(self, feed: Feed, source: Ring, inputs: Ring, *, target: str, text: bool | None = None) -> None:
         self.feed, self.target = feed, target
         self.source = source
-        self.rule = CouplingRule(feed.delay, source_points, target_points)
+        self.rule = feed.rule
         self.columns = [
             column
             for column in feed.columns

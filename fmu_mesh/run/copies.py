@@ -216,8 +216,7 @@ class Copies:
         What an FMU raises is in `errors`, and ends its copy.
         """
         wanted = wanted & ~self._ended
-        points = self._node.instance(instance).step_points
-        np.copyto(self._set_at[instance], self.points // points, where=wanted)
+        np.copyto(self._set_at[instance], self._steps_done(instance), where=wanted)
         self._is_set.add(instance)
         variable = self._plan.system.instances[instance].description.variable(name)
         shape = variable.shape if variable is not None else ()
@@ -230,6 +229,11 @@ class Copies:
         over_time = instance in self._timed and variable is not None and variable.causality == "input"
         access = None if over_time else self._access(instance, "Set", (name,))
         self._call(access, values, wanted, by_python)
+
+    def _steps_done(self, instance: str) -> NDArray[np.int64]:
+        own = self._node.instance(instance)
+        done = (self.points + own.step_points - 1 - own.wait_points) // own.step_points
+        return np.minimum(done, self._last // own.step_points)
 
     def get(self, instance: str, names: Sequence[str], out: NDArray[Any]) -> None:
         """Read variables of one type into ``out``, of shape (count, elements) and their dtype.
@@ -247,7 +251,8 @@ class Copies:
                 first += place.size
             if instance not in self._is_set:
                 return
-            wanted = self._set_at[instance] == self.points // members.step_points
+            rows = self.points // members.step_points  # the model of an instance that goes ahead may be at the next one
+            wanted = (self._set_at[instance] == rows) & (self._steps_done(instance) == rows)
             if not wanted.any():
                 return
         else:

@@ -54,7 +54,8 @@ class LocalMember:
         self._outputs = Ring(self.plan.outputs, 1 << (2 * -(-oldest // self.plan.step_points)).bit_length())
         self.is_finite = FiniteRows(self.plan, self._outputs, self._inputs)
         self._looks_at_rows = True
-        self._points = self.plan.step_points
+        self._points, self._wait = self.plan.step_points, self.plan.wait_points
+        self._last_step, self._rule_of = plan.grid.last_point // self._points, plan.rule_of
         self._feeds: list[_Feed] = []
         self._timed: list[LocalMember] = []  # those that get values over time before its step
         self._courses: dict[str, Course] = {}
@@ -148,43 +149,46 @@ class LocalMember:
                 continue
             columns = [*consistent_columns(c, self._consistent)]
             if len(columns) > 1 or (c.source_instance, c.source_name) in self._consistent:
-                self._feed_consistent(columns, members)
+                self._feed_consistent(columns, members, self._rule_of(c))
                 continue
-            read, points = members[c.source_instance].reader(c.source_name)
-            lead = CouplingRule(c.delay or 0, points, self._points).lead
+            read, _ = members[c.source_instance].reader(c.source_name)
+            rule = self._rule_of(c)
             own = ValueChange.of_connection(c)
             change: Callable[[Value], Value] | None = None
             if (c.factor, c.offset) != (1.0, 0.0):
                 change = partial(scaled, factor=c.factor, offset=c.offset)
             elif c.map or own.is_checked(c.source.type):
                 change = own.of
-            self._feeds.append(_Feed(read, points, lead, change, self._inputs.writer(c.target_name)))
+            write = self._inputs.writer(c.target_name)
+            self._feeds.append(_Feed(read, rule.source_points, rule.lead, rule.last, change, write))
 
     def _feed_consistent(
-        self, columns: Sequence[tuple[str, int, FeedColumn]], members: Mapping[str, LocalMember]
+        self, columns: Sequence[tuple[str, FeedColumn]], members: Mapping[str, LocalMember], rule: CouplingRule
     ) -> None:
         """Elements of one connection, of which some are consistent outputs: each is the sum of its terms."""
-        for target in dict.fromkeys(column.target for _, _, column in columns):
-            own = [(source, column) for source, _, column in columns if column.target == target]
+        for target in dict.fromkeys(column.target for _, column in columns):
+            own = [(source, column) for source, column in columns if column.target == target]
             reads = [(members[source].reader(column.source)[0], column.factor, column.offset) for source, column in own]
-            points = members[own[0][0]].plan.step_points  # those of all of them
-            lead = CouplingRule(columns[0][1], points, self._points).lead
-            self._feeds.append(_Feed(partial(_sum, reads), points, lead, None, self._inputs.writer(target)))
+            write = self._inputs.writer(target)
+            self._feeds.append(_Feed(partial(_sum, reads), rule.source_points, rule.lead, rule.last, None, write))
 
     def reader(self, variable: str) -> tuple[Callable[[int], Value], int]:
         """See `LocalSystem.reader`."""
         return self._outputs.reader(variable), self.plan.step_points
 
     def step_from(self, point: int) -> None:
-        """Take the own step that ends at ``point + 1``, if there is one, with the inputs that the delays prescribe."""
-        if (point + 1) % self._points:
-            return
+        """Take an own step before ``point + 1``, if there is one, with the inputs that the delays prescribe.
+
+        It ends there; that of an instance that goes ahead begins at ``point``.
+        """
         step = self.step
         start = step * self._points
+        if start + self._wait > point or step >= self._last_step:
+            return
         for member in self._timed:
             member.prescribe(step)
-        for read, points, lead, change, write in self._feeds:
-            value = read((start + lead) // points)  # `CouplingRule.row_for`, without a call
+        for read, points, lead, last, change, write in self._feeds:
+            value = read(min((start + lead) // points, last))  # `CouplingRule.row_for`
             write(0, value if change is None else change(value))
         self._do_step(step)
         if floating_point_changed():
@@ -233,7 +237,11 @@ class LocalMember:
         read, points = self._outputs.reader(name), self._points
         if points == 1:
             return lambda point: from_model(point) if self._set_at == self.step else read(point)
-        return lambda point: from_model(point) if self._set_at == self.step else read(point // points)
+
+        def from_row(point: int) -> Value:  # the model of an instance that goes ahead is at a later point
+            return from_model(point) if self._set_at == self.step == point // points else read(point // points)
+
+        return from_row
 
     def set(self, values: Mapping[str, Value]) -> None:
         """See `LocalSystem.set`."""
@@ -340,11 +348,12 @@ class LocalMember:
 
 
 class _Feed(NamedTuple):
-    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` and ``lead``."""
+    """How an input gets its value: ``read`` a row of the source; see `CouplingRule` for ``points`` to ``last``."""
 
     read: Callable[[int], Value]
     points: int
     lead: int
+    last: int
     change: Callable[[Value], Value] | None
     write: Callable[[int, Value], None]
 

@@ -68,6 +68,7 @@ class Connection(msgspec.Struct, frozen=True):
         path: its place in the configuration file, such as `connections[2]`.
         units: the unit conversion in words; empty if there is none.
         extrapolation: how the target's input changes within a step; None: as the target or the simulation says.
+        ahead: see `CouplingRule`.
     """
 
     source_instance: str
@@ -84,6 +85,7 @@ class Connection(msgspec.Struct, frozen=True):
     units: str = ""
     map: tuple[tuple[int, int], ...] = ()
     items: tuple[tuple[str, int], ...] = ()
+    ahead: bool = False
 
     @property
     def initial_only(self) -> bool:

@@ -7,6 +7,9 @@ The ways of `extrapolation`, for the last value ``v`` of a source and its change
 * midpoint: it is constant, with the value of that line in the middle of the step, so the coupling is of order 2
   (`MidpointInputs`). After a jump of the source it is ``v``.
 
+With a delay of 0, the line of a source with a larger step goes through both ends of that step, if the source can go
+ahead of the target (`fmu_mesh.system.execution_order`). Else it goes on from the step before.
+
 An output ``y`` that depends directly on an input ``u`` belongs to the input that its last step used, which is a step
 old: FMI does not let a co-simulation evaluate it again. With `loops: solved` whoever reads it gets
 ``y + D (u* - u)`` instead, with the derivative ``D``, the input ``u`` that was used, and the consistent input ``u*``,
@@ -20,11 +23,13 @@ loop of `--local`.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+
+from ..simtime import ENDLESS
 
 __all__ = ["Consistent", "CouplingRule", "SourceLine", "Term", "jumps_in"]
 
@@ -34,39 +39,42 @@ _PART: Final = 0.1
 changes by more than this part of its value. At a turning point, and at the start from rest, a smooth source does the
 former."""
 
-Steps = TypeVar("Steps", int, NDArray[np.intp])
 
-
-class CouplingRule(msgspec.Struct, frozen=True):
+class CouplingRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The rule for one source and one target.
 
     Own step j of the target covers the points ``j * target_points`` to ``(j + 1) * target_points``. It reads the source
     at the first of them with a delay of 1, and at the last of them with a delay of 0. A source whose step takes several
-    points holds its value between two of them.
+    points holds its value between two of them; if it goes ahead, the target reads the end of its step instead (ADR 96).
 
     Example:
-        >>> rule = CouplingRule(delay=1, source_points=2, target_points=1)
-        >>> [rule.row_for(step) for step in range(5)]
+        >>> [CouplingRule(delay=1, source_points=2, target_points=1).row_for(step) for step in range(5)]
         [0, 0, 1, 1, 2]
+        >>> [CouplingRule(delay=0, source_points=2, target_points=1, ahead=True).row_for(step) for step in range(5)]
+        [1, 1, 2, 2, 3]
 
     Attributes:
         delay: delay of the connection in points: 0 or 1.
         source_points: base points per step of the source; 1 or more.
         target_points: base points per step of the target; 1 or more.
+        ahead: whether the target reads the first row at the end of its step or later; only with a delay of 0.
+        last: the last row of the source: its next one would come after the end of the run.
     """
 
     delay: int
     source_points: int
     target_points: int
+    ahead: bool = False
+    last: int = ENDLESS
 
     @property
     def lead(self) -> int:
-        """Number of points from the start of the target's step to the point whose value it reads."""
-        return 0 if self.delay else self.target_points
+        """Points from the start of the target's step to that whose value it reads, or after which there is no other."""
+        return 0 if self.delay else self.target_points + (self.source_points - 1 if self.ahead else 0)
 
-    def row_for(self, step: Steps) -> Steps:
-        """The row of the source that feeds own step ``step`` of the target; also for an array of steps."""
-        return (step * self.target_points + self.lead) // self.source_points
+    def row_for(self, step: int) -> int:
+        """The row of the source that feeds own step ``step`` of the target."""
+        return min((step * self.target_points + self.lead) // self.source_points, self.last)
 
 
 class SourceLine(msgspec.Struct, frozen=True):

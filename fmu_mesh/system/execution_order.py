@@ -1,4 +1,7 @@
-"""In which order instances step within one point, and the delay of every connection (docs/architecture.md)."""
+"""In which order instances step within one point, and the delay of every connection (docs/architecture.md).
+
+And which slow instances take their steps ahead of those that read them (ADR 96).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from .feeds import consistent_columns
 from .graph import cycle_through, feedback_edges, is_cycle, strongly_connected, topological_order
 from .solved_groups import Blocks, within_block
 
-__all__ = ["ExecutionOrder", "execution_order"]
+__all__ = ["ExecutionOrder", "execution_order", "steps_ahead"]
 
 
 class ExecutionOrder(NamedTuple):
@@ -58,12 +61,45 @@ def execution_order(  # noqa: PLR0913, PLR0917  what the order follows from
         if c.delay == 0:
             columns = consistent_columns(c, consistent or {})
             target = blocks.get(c.target_instance, c.target_instance)
-            instant += [(blocks.get(source, source), target) for source, _, _ in columns]
+            instant += [(blocks.get(source, source), target) for source, _ in columns]
     of = {vertex: [name for name in names if blocks.get(name, name) == vertex] for vertex in vertices}
     order = tuple(name for vertex in topological_order(vertices, instant) for name in of[vertex])
     parts = [part for part in strongly_connected(vertices, edges) if is_cycle(part, edges)]
     cycles = tuple(tuple(name for vertex in part for name in of[vertex]) for part in parts)
     return ExecutionOrder(tuple(connections), closing, order, cycles)
+
+
+def steps_ahead(
+    made: ExecutionOrder,
+    step_points: Mapping[str, int],
+    blocks: Blocks,
+    consistent: Mapping[tuple[str, str], Consistent],
+) -> tuple[tuple[Connection, ...], tuple[str, ...]]:
+    """The connections, with those that read the end of a step of a slower source, and the instances that go ahead.
+
+    Who goes ahead takes a step as soon as all are at its first point. So it needs no value of a later point: its inputs
+    have a delay of 1, or come from others that go ahead, whose steps end with one of its own.
+    """
+    reads: dict[str, list[tuple[str, int | None]]] = {blocks.get(name, name): [] for name in made.order}
+    sources: list[set[str]] = []
+    for c in made.connections:
+        columns = () if c.initial_only else consistent_columns(c, consistent)
+        sources.append({blocks.get(source, source) for source, _ in columns})
+        reads[blocks.get(c.target_instance, c.target_instance)] += [(source, c.delay) for source in sources[-1]]
+    able, ahead = set[str](), set[str]()
+    for name, own in reads.items():
+        if all(delay or (source in able and step_points[source] % step_points[name] == 0) for source, delay in own):
+            able.add(name)
+    connections = []
+    for c, own_sources in zip(made.connections, sources, strict=True):
+        is_line = c.extrapolation in {"linear", "midpoint"} and c.delay == 0
+        is_slower = step_points[c.source_instance] > step_points[c.target_instance]
+        connections.append(replace(c, ahead=is_line and is_slower and own_sources <= able))
+        ahead |= own_sources if connections[-1].ahead else set()
+    for name in reversed(reads):
+        if name in ahead:
+            ahead |= {source for source, delay in reads[name] if not delay}
+    return tuple(connections), tuple(name for name in made.order if blocks.get(name, name) in ahead)
 
 
 def _edges(connections: Iterable[Connection], blocks: Blocks) -> list[tuple[str, str]]:

@@ -1,9 +1,8 @@
-"""The connections of an instance, grouped by source and delay: what a node needs of them in a run."""
+"""The connections of an instance, grouped by source and rule: what a node needs of them in a run."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import msgspec
@@ -59,23 +58,28 @@ class Compared(NamedTuple):
 
 
 class Feed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All connections from one instance to another that have the same delay."""
+    """All connections from one instance to another that follow the same rule."""
 
     source: str
-    delay: int
+    rule: CouplingRule
     columns: tuple[FeedColumn, ...]
 
 
-def feeds_of(connections: Iterable[Connection]) -> tuple[Feed, ...]:
-    """The feeds of connections to one instance, sorted by source and delay; all delays are known."""
-    return _grouped((c.source_instance, c.delay or 0, _column(c)) for c in connections)
+RuleOf = Callable[[Connection], CouplingRule]
+
+
+def feeds_of(connections: Iterable[Connection], rule_of: RuleOf) -> tuple[Feed, ...]:
+    """The feeds of connections to one instance, sorted by source and rule; all delays are known."""
+    return _grouped((c.source_instance, rule_of(c), _column(c)) for c in connections)
 
 
 def step_feeds_of(
-    connections: Iterable[Connection], consistent: Mapping[tuple[str, str], Consistent]
+    connections: Iterable[Connection], consistent: Mapping[tuple[str, str], Consistent], rule_of: RuleOf
 ) -> tuple[Feed, ...]:
     """As `feeds_of`, for steps: a connection from a consistent output becomes one column for each of its terms."""
-    return _grouped(chain.from_iterable(consistent_columns(c, consistent) for c in connections))
+    return _grouped(
+        (source, rule_of(c), column) for c in connections for source, column in consistent_columns(c, consistent)
+    )
 
 
 def reads_of(
@@ -86,28 +90,30 @@ def reads_of(
         (source, column.source, c.target_instance)
         for c in connections
         if not c.initial_only
-        for source, _, column in consistent_columns(c, consistent)
+        for source, column in consistent_columns(c, consistent)
     ]
 
 
 def consistent_columns(
     c: Connection, consistent: Mapping[tuple[str, str], Consistent]
-) -> Iterator[tuple[str, int, FeedColumn]]:
-    """The source, the delay and the column of each value that a step needs for a connection, in their order."""
-    delay = c.delay or 0
+) -> Iterator[tuple[str, FeedColumn]]:
+    """The source and the column of each value that a step needs for a connection, in their order.
+
+    All these sources have the same step size.
+    """
     pairs = [*element_pairs(c)] if any(instance == c.source_instance for instance, _ in consistent) else []
     if not any((c.source_instance, source) in consistent for source, _ in pairs):
-        yield c.source_instance, delay, _column(c)
+        yield c.source_instance, _column(c)
         return
     for source, target in pairs:
         own = consistent.get((c.source_instance, source))
         if own is None:
-            yield c.source_instance, delay, FeedColumn(source, target, c.factor, c.offset)
+            yield c.source_instance, FeedColumn(source, target, c.factor, c.offset)
             continue
         scaled = own.scaled(c.factor, c.offset)
         for number, term in enumerate(scaled.terms):
             offset = scaled.constant if not number else 0.0
-            yield term.instance, delay, FeedColumn(term.column, target, term.factor, offset, adds=number > 0)
+            yield term.instance, FeedColumn(term.column, target, term.factor, offset, adds=number > 0)
 
 
 def compared_of(
@@ -115,10 +121,13 @@ def compared_of(
     consistent: Mapping[tuple[str, str], Consistent],
     step_points: Mapping[str, int],
 ) -> Iterator[Compared]:
-    """What targets assume over their steps, as far as it can be compared: continuous inputs with continuous sources."""
+    """What targets assume over their steps, as far as it can be compared: continuous inputs with continuous sources.
+
+    Where a source goes ahead, its target knows what will come, and assumes nothing.
+    """
     for c in connections:
         ends = c.source, c.target
-        if c.initial_only or any(not is_float(end.type) or end.variability != "continuous" for end in ends):
+        if c.initial_only or c.ahead or any(not is_float(end.type) or end.variability != "continuous" for end in ends):
             continue
         rule = CouplingRule(c.delay or 0, step_points[c.source_instance], step_points[c.target_instance])
         for source, target in element_pairs(c):
@@ -132,9 +141,10 @@ def _column(c: Connection) -> FeedColumn:
     return FeedColumn(c.source_name, c.target_name, c.factor, c.offset, c.map, c.items)
 
 
-def _grouped(columns: Iterable[tuple[str, int, FeedColumn]]) -> tuple[Feed, ...]:
+def _grouped(columns: Iterable[tuple[str, CouplingRule, FeedColumn]]) -> tuple[Feed, ...]:
     """The feeds of these columns. Terms are sorted by their instances, so they stay in their order."""
-    feeds: dict[tuple[str, int], list[FeedColumn]] = {}
-    for source, delay, column in columns:
-        feeds.setdefault((source, delay), []).append(column)
-    return tuple(Feed(source=s, delay=d, columns=tuple(own)) for (s, d), own in sorted(feeds.items()))
+    feeds: dict[tuple[str, CouplingRule], list[FeedColumn]] = {}
+    for source, rule, column in columns:
+        feeds.setdefault((source, rule), []).append(column)
+    ordered = sorted(feeds, key=lambda own: (own[0], own[1].delay, own[1].ahead))
+    return tuple(Feed(source, rule, tuple(feeds[source, rule])) for source, rule in ordered)

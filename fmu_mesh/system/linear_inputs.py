@@ -16,6 +16,7 @@ from ..config.mesh import Config
 from ..text import counted
 from ..variables.model_description import ModelDescription
 from .connections import Connection
+from .coupling_rule import CouplingRule
 from .solved_groups import blocks_of, is_solved
 
 __all__ = ["LinearInput", "counted_ways", "with_extrapolation"]
@@ -25,20 +26,17 @@ class LinearInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An input that follows the line of its source within a step: as a line, or with the value in its middle.
 
     Attributes:
-        delay: that of its connection: 0 or 1.
-        source_points: base points per step of its source.
+        rule: that of its connection.
         ends: whether the row of outputs has the input, and gets its value at the end of the step.
     """
 
     name: str
-    delay: int
-    source_points: int = 1
+    rule: CouplingRule
     ends: bool = False
 
-    def latest(self, begin: int, points: int) -> int:
-        """The point of the row of the source that a step of so many points gets, as in `CouplingRule`."""
-        end = begin if self.delay else begin + points
-        return end - end % self.source_points
+    def latest(self, step: int) -> int:
+        """The point of the row of the source that own step ``step`` gets."""
+        return self.rule.row_for(step) * self.rule.source_points
 
 
 def with_extrapolation(

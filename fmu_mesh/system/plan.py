@@ -23,9 +23,9 @@ from ..variables.value_conversion import ValueRefused, to_plain
 from ..variables.value_types import PlainValue, is_float
 from .attempt import Attempt
 from .consistent_outputs import consistent_outputs
-from .coupling_rule import Consistent
+from .coupling_rule import Consistent, CouplingRule
 from .digest import digest_of
-from .execution_order import execution_order
+from .execution_order import execution_order, steps_ahead
 from .feeds import Feed, compared_of, feeds_of, reads_of, step_feeds_of
 from .initialization_plan import InitializationPlan, Loop, check_loops, plan_initialization
 from .input_timeouts import InputTimeout
@@ -56,6 +56,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         section: its section of the configuration, without the common keys: their meaning is in the other fields. It is
             decoded with the hook `fmu_mesh.instances.registry.decode_section`, because only that knows the kinds.
         step_feeds: what its steps read: the connections, with what makes outputs consistent.
+        ahead: whether it takes its steps ahead of those that read it; see `steps_ahead`.
         linear_inputs: the inputs that change linearly within a step; ``midpoint_inputs``: those that get the middle.
         row: the inputs that are set in every step: ``inputs``, and the Float64 inputs of the scenario and of keys.
         parameters: the connections to parameters, whose values are transferred in Initialization Mode only.
@@ -77,6 +78,7 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     step_feeds: tuple[Feed, ...]
     initialization: dict[str, int]
     section: InstanceSection
+    ahead: bool = False
     linear_inputs: tuple[LinearInput, ...] = ()
     midpoint_inputs: tuple[LinearInput, ...] = ()
     scenario: tuple[Schedule, ...] = ()
@@ -95,6 +97,11 @@ class InstancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def input_row(self) -> Layout:
         """The inputs that are set in every step."""
         return self.row if self.row is not None else self.inputs
+
+    @property
+    def wait_points(self) -> int:
+        """Where all step point by point: the points from the first one of its step to that after which it is taken."""
+        return 0 if self.ahead else self.step_points - 1
 
     @property
     def sources(self) -> dict[str, str]:
@@ -195,6 +202,7 @@ class Plan(msgspec.Struct, frozen=True):
         order: instance names in execution order within one point.
         cycles: instance names of every cycle.
         closing: the connections that have a delay of 1 because they close a cycle.
+        ahead: the instances that take their steps ahead of those that read them.
         consistent: the formula of each output that is made consistent, by instance and name of the output or element.
         groups: the groups that are solved.
         nodes: by node name, with the recorder if there is one.
@@ -206,6 +214,7 @@ class Plan(msgspec.Struct, frozen=True):
     order: tuple[str, ...]
     cycles: tuple[tuple[str, ...], ...]
     closing: tuple[Connection, ...]
+    ahead: tuple[str, ...]
     consistent: dict[tuple[str, str], Consistent]
     groups: tuple[SolvedGroup, ...]
     initialization: InitializationPlan
@@ -229,6 +238,12 @@ class Plan(msgspec.Struct, frozen=True):
     def outputs(self) -> dict[str, Layout]:
         """The columns of the rows of each instance."""
         return {item.name: item.outputs for node in self.nodes.values() for item in node.instances}
+
+    def rule_of(self, connection: Connection) -> CouplingRule:
+        """Which row of its source a step of its target gets."""
+        c, instances = connection, self.system.instances
+        source, target = (instances[name].step_points for name in (c.source_instance, c.target_instance))
+        return CouplingRule(c.delay or 0, source, target, c.ahead, self.grid.last_point // source)
 
     def node_of(self, instance: str) -> str:
         """The name of the node of an instance."""
@@ -257,7 +272,8 @@ def make_plan(
     consistent = consistent_outputs(system.connections, direct, points, findings)
     solved = consistent if system.config.simulation.loops == "solved" else None
     made = execution_order(names, system.connections, how, findings, blocks, solved)
-    connections, closing, order, cycles = made
+    _, closing, order, cycles = made
+    connections, ahead = steps_ahead(made, points, blocks, consistent)
     groups = solved_groups(system.config.members, connections, order, system.feedthrough)
     compares = system.config.simulation.defects and system.records  # it is done where rows are written
     system = replace(
@@ -271,7 +287,9 @@ def make_plan(
     outputs = system.output_layouts(read[:2] for read in reads)
     window = window_of(system.config.simulation.window if window is None else window, outputs.values())
     played = played_nodes(system, outputs).names if keeps_states(system.config.recovery) else ()
-    plan = Plan(system, connections, order, cycles, closing, consistent, groups, initialization, window, "", {}, played)
+    plan = Plan(
+        system, connections, order, cycles, closing, ahead, consistent, groups, initialization, window, "", {}, played
+    )
     kept = {name: own.names for name, own in outputs.items() if system.instances[name].node in played}
     nodes = _nodes(plan, outputs, links_of(system, reads, initialization, kept))
     digest = _digest(system, nodes, contents)
@@ -392,15 +410,16 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
         step_points=instance.step_points,
         outputs=outputs,
         inputs=Layout.of(v for v in instance.description.variables if v.name in connected),
-        feeds=feeds_of(stepped),
-        step_feeds=step_feeds_of(stepped, plan.consistent),
+        feeds=feeds_of(stepped, plan.rule_of),
+        step_feeds=step_feeds_of(stepped, plan.consistent, plan.rule_of),
         initialization={v: level for (own, v), level in plan.initialization.levels.items() if own == instance.name},
         section=placed(plan.system.config.instances[instance.name], instance.not_finite),
+        ahead=instance.name in plan.ahead,
         linear_inputs=_following(plan, stepped, "linear"),
         midpoint_inputs=_following(plan, stepped, "midpoint"),
         scenario=instance.scenario,
         row=row_of(instance.description, driven, connected),
-        parameters=feeds_of(initial),
+        parameters=feeds_of(initial, plan.rule_of),
         initial_inputs=Layout.of(v for v in instance.description.variables if v.name in initialized),
         initial_outputs=Layout.of(v for v in instance.description.variables if v.name in read),
         finite=checked if instance.not_finite == "stop" else (),
@@ -414,9 +433,5 @@ def _instance_plan(plan: Plan, instance: SystemInstance, outputs: Layout) -> Ins
 
 def _following(plan: Plan, connections: Sequence[Connection], way: Extrapolation) -> tuple[LinearInput, ...]:
     """The inputs of these connections that follow the line of their source in one way."""
-    points, ends = plan.system.instances, bool(plan.consistent)
-    return tuple(
-        LinearInput(c.target.name, c.delay or 0, points[c.source_instance].step_points, ends=ends)
-        for c in connections
-        if c.extrapolation == way
-    )
+    ends = bool(plan.consistent)
+    return tuple(LinearInput(c.target.name, plan.rule_of(c), ends) for c in connections if c.extrapolation == way)

@@ -79,7 +79,7 @@ def saved_instances(
         used = {schedule.variable for schedule in own.scenario} | {variable for end, variable in ends if end == name}
         agreed = {
             "kind": f"{described.kind} {described.fmi_version}".strip(),
-            "step": counted(own.step_points, "point"),
+            "step": counted(own.step_points, "point") + (" ahead" if name in plan.ahead else ""),
             "model": _hash((contents.get(name, ""), described.guid)),
             "variables": _hash([(v.name, v.type, v.shape, v.causality, v.variability) for v in described.variables]),
             "options": _hash(placed(plan.system.config.instances[name]).agreed()),
@@ -90,7 +90,8 @@ def saved_instances(
         if groups := [group for group in plan.groups if name in group.members]:
             agreed["group"] = _hash(groups)
         if plan.consistent:
-            agreed["consistent outputs"] = _hash(plan.nodes[own.node].instance(name).step_feeds)
+            feeds = plan.nodes[own.node].instance(name).step_feeds
+            agreed["consistent outputs"] = _hash([(feed.source, feed.rule.delay, feed.columns) for feed in feeds])
         agreed |= {
             f"variable '{v.name}'": f"{v.type}{[*v.shape] if v.shape else ''} {v.causality}"
             for v in described.variables

@@ -76,10 +76,12 @@ def written(place: Place, kind: str = "chain", **sections: Any) -> Path:  # noqa
         instances["pendulum"]["step_size"] = 0.004
         instances["slow"]["step_size"] = 0.002
         instances["gain"]["step_size"] = 0.003
-    elif kind == "group of rates":
+    elif kind in {"group of rates", "group that goes ahead"}:
         for name, step in (("slow", 0.001), ("gain", 0.002)):
             instances[name] |= {"group": "both", "step_size": step}
-        connections[-1:] = ["slow.y -> gain.u", "gain.y -> slow.v"]
+        delay, way = (None, "hold") if kind == "group of rates" else (1, "midpoint")
+        connections[-1:] = [{"from": "slow.y", "to": "gain.u", "delay": delay}]
+        connections += [{"from": "gain.y", "to": "slow.v", "extrapolation": way}]
     elif kind == "cvode":
         solved = build_event_fmu("Oscillator", 2, place.folder, only="model_exchange")
         instances["lacks"] = {"fmu": str(solved), "solver": {"name": "cvode"}}
@@ -138,6 +140,7 @@ WAYS: dict[str, dict[str, Any]] = {
         ("groups", "both"),
         ("rates", "master"),
         ("group of rates", "both"),
+        ("group that goes ahead", "both"),
         ("cvode", "lacks"),
         ("held", "gain"),
         ("window 1", "master"),

@@ -18,6 +18,7 @@ from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings import native
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.coupling_rule import CouplingRule
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind
@@ -67,7 +68,8 @@ def driven(
     """The outputs after each step, with ``values`` of the input: at the start and at the end of all steps."""
     is_linear = extrapolation != "hold"
     options = StepOptions(
-        linear_inputs=(LinearInput(system.input, int(extrapolation)),) if is_linear else (), solver=solver
+        linear_inputs=(LinearInput(system.input, CouplingRule(int(extrapolation), 1, 1)),) if is_linear else (),
+        solver=solver,
     )
     inputs = Ring(Layout.of([(system.input, "Float64")]), 1)
     outputs = Ring(Layout.of(v for v in read_description(fmu).variables if v.name in system.outputs), 1)

@@ -83,3 +83,52 @@ def test_a_loop_that_is_only_delayed_is_told(name: str) -> None:
 def test_stiff_masses_need_more_than_a_solved_loop() -> None:
     with pytest.raises(fmu_mesh.NotFinite):
         error_of("HotThermal", 0.02, loops="solved", extrapolation="midpoint")
+
+
+WAVE: Final = """
+import math
+
+import fmu_mesh
+
+
+class Wave(fmu_mesh.Component):
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output(depends_on=())
+
+    def step(self, time, step_size):
+        self.y = math.sin(time + step_size)
+
+
+class Integral(fmu_mesh.Component):
+    u = fmu_mesh.Input()
+    y = fmu_mesh.Output(depends_on=())
+
+    def step(self, time, step_size):
+        self.y += step_size * self.u
+"""
+"""A source with exact values, and a target that integrates lines exactly, by the value in the middle of its steps."""
+
+SLOW: Final = {
+    "hold": (2.0e-2, 5.0e-2, 1.0e-1),  # H / 2
+    "extrapolated": (8.0e-4, 5.0e-3, 2.0e-2),  # H^2 / 2: 5 / 6 H^2 between its ends, and no line in the first step
+    "interpolated": (2.667e-4, 1.667e-3, 6.667e-3),  # H^2 / 6
+}
+"""The largest errors for steps H of the source of 40, 100 and 200 ms, as the series of the error says."""
+
+
+@pytest.mark.parametrize("way", SLOW)
+def test_a_line_between_both_ends_of_slow_steps_is_of_order_2(way: str, tmp_path: Path) -> None:
+    (tmp_path / "wave.py").write_text(WAVE, encoding="utf-8")
+    errors = []
+    for size in (0.04, 0.1, 0.2):
+        mesh = fmu_mesh.Mesh("wave", step_size=0.001, stop_time=7.0)
+        mesh.configure(simulation={"extrapolation": "hold" if way == "hold" else "midpoint"})
+        for name, kind, own in (("wave", "Wave", size), ("integral", "Integral", 0.001), ("fast", "Integral", 0.001)):
+            mesh.add(name, python=f"{tmp_path / 'wave.py'}:{kind}", step_size=own)
+        mesh.connect("wave.y", "integral.u")
+        if way == "extrapolated":  # the source waits for the end of its step
+            mesh.connect("fast.y", "wave.u")
+        result = mesh.run(processes=False, record="memory")
+        errors.append(float(np.abs(result["integral.y"] + np.cos(result.times) - 1.0).max()))
+
+    assert errors == pytest.approx(SLOW[way], rel=0.1)

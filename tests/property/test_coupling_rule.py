@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -59,6 +58,12 @@ def test_rows_are_read_in_their_order(rule: CouplingRule, step: int) -> None:
     assert rule.row_for(step) <= rule.row_for(step + 1)
 
 
-@given(rules, st.integers(0, 50))
-def test_an_array_of_steps_reads_what_each_of_them_reads(rule: CouplingRule, count: int) -> None:
-    assert rule.row_for(np.arange(count)).tolist() == [rule.row_for(step) for step in range(count)]
+@given(points, points, steps, st.integers(0, 5000))
+def test_ahead_a_step_reads_the_first_row_at_its_end_or_later(source: int, target: int, step: int, last: int) -> None:
+    rule = CouplingRule(0, source, target, ahead=True, last=last)
+    end = (step + 1) * target
+
+    row = rule.row_for(step)
+
+    assert row == last or row * source >= end
+    assert (row - 1) * source < end

@@ -83,11 +83,10 @@ class EngineMesh:
         return RECORDER in self._plan.nodes
 
     def _engine(self, node: NodePlan, make: MakeEngine) -> Engine:
-        step_points = {name: runner.plan.step_points for name, runner in self.runners.items()}
         sources = {name: [SourceRows(*ring)] for name, ring in self.rings.items()}
         for item in node.instances:
             runner = self.runners[item.name]
-            runner.sources.extend(sources_of(runner, sources, step_points))
+            runner.sources.extend(sources_of(runner, sources))
             runner.instance.enter_initialization(self._plan.grid.start_time, None, item.start_values)
             runner.instance.exit_initialization()
             runner.bind()

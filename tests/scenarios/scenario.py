@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from fmu_mesh.config.instance_sections import KIND
+from fmu_mesh.config.instance_sections import KIND, Extrapolation
 from fmu_mesh.config.mesh import Config
 from fmu_mesh.instances.registry import decode_section
 from fmu_mesh.rings.ring import Ring
@@ -51,6 +51,7 @@ class Scenario:
         algorithm: `gauss_seidel` or `jacobi`.
         steps: base points per own step, where it is not 1.
         feedthrough: instances whose initial output depends on their inputs.
+        extrapolation: of all connections.
     """
 
     connections: Sequence[str]
@@ -58,6 +59,7 @@ class Scenario:
     algorithm: str = "gauss_seidel"
     steps: Mapping[str, int] = field(default_factory=dict)
     feedthrough: str = ""
+    extrapolation: Extrapolation = "hold"
 
     def plan(self, *, groups: Mapping[str, str] | None = None, window: int = 16, record: bool = False) -> Plan:
         """The plan, with instances placed in groups."""
@@ -98,6 +100,7 @@ class Scenario:
                     0.0,
                     int(delay) if delay else None,
                     f"connections[{index}]",
+                    self.extrapolation,
                 )
                 for index, (source, target, delay) in enumerate(ends)
             ),

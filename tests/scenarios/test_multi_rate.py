@@ -175,6 +175,81 @@ fast: 5 -> 6 uses slow@5
     system.assert_the_same_on_any_nodes()
 
 
+def traced(*connections: str, points: int, **steps: int) -> str:
+    """The steps of a system whose inputs follow lines, which are the same on any nodes."""
+    system = Scenario(connections, points=points, steps=steps, extrapolation="midpoint")
+    system.assert_the_same_on_any_nodes()
+    return system.in_one_loop()
+
+
+def test_a_line_of_a_slow_source_ends_with_its_step() -> None:
+    """The source goes ahead; behind its last step, the line goes on."""
+    assert (
+        traced("slow -> fast", points=7, slow=3)
+        == """\
+slow: 0 -> 3
+fast: 0 -> 1 uses slow@3
+fast: 1 -> 2 uses slow@3
+fast: 2 -> 3 uses slow@3
+slow: 3 -> 6
+fast: 3 -> 4 uses slow@6
+fast: 4 -> 5 uses slow@6
+fast: 5 -> 6 uses slow@6
+fast: 6 -> 7 uses slow@6
+"""
+    )
+
+
+def test_lines_of_slow_sources_in_a_chain_and_a_cycle() -> None:
+    assert (
+        traced("a -> b", "b -> c", "c -> b (delay 1)", points=9, a=4, b=2)
+        == """\
+a: 0 -> 4
+b: 0 -> 2 uses a@4, c@0
+c: 0 -> 1 uses b@2
+c: 1 -> 2 uses b@2
+b: 2 -> 4 uses a@4, c@2
+c: 2 -> 3 uses b@4
+c: 3 -> 4 uses b@4
+a: 4 -> 8
+b: 4 -> 6 uses a@8, c@4
+c: 4 -> 5 uses b@6
+c: 5 -> 6 uses b@6
+b: 6 -> 8 uses a@8, c@6
+c: 6 -> 7 uses b@8
+c: 7 -> 8 uses b@8
+c: 8 -> 9 uses b@8
+"""
+    )
+
+
+def test_lines_between_rates_of_which_none_divides_the_other() -> None:
+    assert (
+        traced("a -> b", points=8, a=3, b=2)
+        == """\
+a: 0 -> 3
+b: 0 -> 2 uses a@3
+a: 3 -> 6
+b: 2 -> 4 uses a@6
+b: 4 -> 6 uses a@6
+b: 6 -> 8 uses a@6
+"""
+    )
+
+
+def test_a_slow_source_behind_a_fast_one_does_not_go_ahead() -> None:
+    """It waits for values from the end of its own step, and its targets extrapolate."""
+    assert "b: 0 -> 1 uses slow@0" in traced("a -> slow", "slow -> b", points=6, slow=3)
+    assert "b: 0 -> 1 uses slow@0" in traced("a -> slow", "slow -> b", points=12, a=3, slow=2)
+    assert "b: 0 -> 1 uses slow@2" in traced("a -> slow", "slow -> b", points=12, a=4, slow=2)
+
+
+def test_sources_of_a_source_that_goes_ahead_do_so_too() -> None:
+    """Otherwise, in one process, they would step when it has stepped already."""
+    assert "b: 0 -> 1 uses slow@4, a@4" in traced("a -> slow", "slow -> b", "a -> b", points=8, a=4, slow=4)
+    assert "slow: 0 -> 2 uses a@0" in traced("a -> slow (delay 1)", "slow -> b", points=8, a=4, slow=2)
+
+
 @pytest.mark.parametrize("grouped", [False, True])
 def test_a_very_slow_source_does_not_overwrite_inputs_that_wait(grouped: bool) -> None:  # noqa: FBT001 a parameter of a test
     """One of its values feeds more steps of its target than any window has points."""

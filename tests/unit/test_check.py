@@ -113,6 +113,31 @@ def test_the_page_shows_everything_that_the_plan_decides(
     assert (code, capsys.readouterr().out) == (0, LOOP_PAGE)
 
 
+SLOW = """\
+mesh: slow
+simulation: {stop_time: 1, step_size: 0.1, extrapolation: midpoint}
+instances:
+  fast: {fmu: fmus/Gain.fmu}
+  free: {fmu: fmus/Integrator.fmu, step_size: 0.4}
+  fed: {fmu: fmus/Integrator.fmu, step_size: 0.4}
+  sum: {fmu: fmus/Adder.fmu}
+connections:
+  - free.y -> sum.u1
+  - fed.y -> sum.u2
+  - fast.y -> fed.u
+record: {file: null}
+"""
+
+
+def test_a_slow_source_that_cannot_go_ahead_is_named(tmp_path: Path) -> None:
+    config = write(tmp_path, SLOW)
+    told = "  extrapolated, because the slower source waits for inputs with delay 0: fed.y -> sum.u2"
+
+    assert [line for line in plan_page(prepare(config)) if "extrapolated" in line] == [told]
+    config.write_text(SLOW.replace("fast.y -> fed.u", "free.y -> fed.u"), encoding="utf-8")
+    assert [line for line in plan_page(prepare(config)) if "extrapolated" in line] == []
+
+
 JACOBI = """\
 mesh: jacobi
 simulation: {stop_time: 1, step_size: 0.5, algorithm: jacobi, window: 1}

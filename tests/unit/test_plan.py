@@ -90,7 +90,7 @@ def test_connections_with_other_delays_are_other_feeds() -> None:
     plan = Scenario(("a -> b", "c -> b (delay 1)")).plan()
 
     [target] = plan.nodes["b"].instances
-    assert [(feed.source, feed.delay, feed.columns) for feed in target.feeds] == [
+    assert [(feed.source, feed.rule.delay, feed.columns) for feed in target.feeds] == [
         ("a", 0, (FeedColumn("point", "a"),)),
         ("c", 1, (FeedColumn("point", "c"),)),
     ]

@@ -23,6 +23,7 @@ from fmu_mesh.instances.instance_wrapper import AroundInstance, packed, unpacked
 from fmu_mesh.node.inputs import TimedInputs
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.coupling_rule import CouplingRule
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind
@@ -214,7 +215,7 @@ def test_the_inputs_of_the_last_event_come_back_as_they_were(row: tuple[Any, ...
 
 
 def linear(fmu: Path, folder: Path, ring: Ring, solver: Literal["cvode", "dopri5"]) -> tuple[FmuInstance, Any]:
-    options = StepOptions(linear_inputs=(LinearInput("u", 1),), solver=SolverSettings(solver))
+    options = StepOptions(linear_inputs=(LinearInput("u", CouplingRule(1, 1, 1)),), solver=SolverSettings(solver))
     inner = open_instance(fmu, "m", read_description(fmu, kind="model_exchange"), folder, options=options)
     instance: Any = stepped(inner, options)
     instance.enter_initialization(0.0, 10.0, {})

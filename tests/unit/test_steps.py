@@ -25,6 +25,7 @@ from fmu_mesh.instances.fmi.step_options import SolverSettings, StepOptions
 from fmu_mesh.rings.native import Said
 from fmu_mesh.rings.ring import Ring
 from fmu_mesh.simtime import TimeGrid
+from fmu_mesh.system.coupling_rule import CouplingRule
 from fmu_mesh.system.layout import Layout
 from fmu_mesh.system.linear_inputs import LinearInput
 from fmu_mesh.variables.model_description import Kind, ModelDescription
@@ -391,7 +392,7 @@ def test_an_event_after_a_restored_state_has_its_own_time(causality: str, event_
 
 @pytest.mark.parametrize(("version", "kind"), [(2, "co_simulation"), (2, "model_exchange"), (3, "model_exchange")])
 def test_linear_inputs_are_part_of_the_state(version: Version, kind: Kind, event_fmu: EventFmu, tmp_path: Path) -> None:
-    options = StepOptions(linear_inputs=(LinearInput("u", 1),))
+    options = StepOptions(linear_inputs=(LinearInput("u", CouplingRule(1, 1, 1)),))
     description = read_description(event_fmu("Integral", version), kind=kind)
     rings = [Ring(Layout.of(description.with_causality(causality)), 32) for causality in ("input", "output")]
     for row in range(32):

@@ -41,9 +41,9 @@ def transfer(
     *,
     text: bool | None = None,
 ) -> Transfer:
-    feed = Feed("source", delay, tuple(FeedColumn(*column) for column in columns))
-    points = {"source_points": source_points, "target_points": target_points}
-    return Transfer(feed, source, inputs, target="target", **points, text=text)
+    rule = CouplingRule(delay, source_points, target_points)
+    feed = Feed("source", rule, tuple(FeedColumn(*column) for column in columns))
+    return Transfer(feed, source, inputs, target="target", text=text)
 
 
 def filled(rows: int) -> Ring:

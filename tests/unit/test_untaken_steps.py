@@ -160,7 +160,7 @@ def test_message_that_comes_at_every_step_is_shown_few_times_and_counted(
 def test_an_input_is_linear_within_a_step(
     version: int, name: str, sign: float, delay: int, steps: Steps, tmp_path: Path
 ) -> None:
-    options = StepOptions(linear_inputs=(LinearInput(name, delay),))
+    options = StepOptions(linear_inputs=(LinearInput(name, CouplingRule(delay, 1, 1)),))
     description = read_description(steps(version))
     inputs, outputs = Ring(Layout.of([(name, "Float64")]), 8), Ring(Layout.of([("y", "Float64")]), 8)
     for row in range(8):
@@ -192,8 +192,8 @@ def test_an_input_is_linear_within_a_step(
 def test_a_line_follows_the_steps_of_its_source(
     delay: int, source_points: int, points: int, expected: list[float], steps: Steps, tmp_path: Path
 ) -> None:
-    options = StepOptions(linear_inputs=(LinearInput("u", delay, source_points),))
     rule = CouplingRule(delay, source_points, points)
+    options = StepOptions(linear_inputs=(LinearInput("u", rule),))
     inputs, outputs = Ring(Layout.of([("u", "Float64")]), 1), Ring(Layout.of([("y", "Float64")]), 1)
     found = []
     with closing(open_instance(steps(2), "m", read_description(steps(2)), tmp_path, options=options)) as inner:
@@ -211,7 +211,7 @@ def test_a_line_follows_the_steps_of_its_source(
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_discarded_step_with_a_linear_input_is_a_failure(version: int, steps: Steps, tmp_path: Path) -> None:
-    options = StepOptions(linear_inputs=(LinearInput("u", 1),))
+    options = StepOptions(linear_inputs=(LinearInput("u", CouplingRule(1, 1, 1)),))
 
     with running(steps(version), tmp_path, "co_simulation", 0.25, options, longest_step=0.2) as instance:
         instance.set_input_derivatives({"u": 0.0})

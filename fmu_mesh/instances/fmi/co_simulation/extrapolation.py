@@ -3,7 +3,8 @@
 Owns the line of an input: the one through the last two rows of its source that the instance has got, at the points to
 which they belong. It follows from rows and points only, so it is the same in every process. A connection with delay 1
 gives a row of the start of a step or earlier: the input is extrapolated. One with delay 0 gives the row of the end of
-a step, if the source has one there: the input is interpolated. `FmuInstance` says how an FMU gets a derivative.
+a step, if the source has one there, or a later one if the source goes ahead: the input is interpolated. `FmuInstance`
+says how an FMU gets a derivative.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class LinearInputs(AroundInstance[FmuInstance]):
         slopes = {}
         for number, item in enumerate(self._inputs):
             column, before = self._columns[number], self._lines[number]
-            line = before.through(float(row[column]), item.latest(begin, self._points))
+            line = before.through(float(row[column]), item.latest(step))
             row[column] = value = line.at(begin)
             # An extrapolation of a smooth source is wrong by less than what it changes in a step of its own.
             allowed = 0.5 * max(abs(before.change), abs(line.change))
