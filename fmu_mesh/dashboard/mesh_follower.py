@@ -8,7 +8,8 @@ is made of what is there, and never waits for the mesh.
 # * `follow KEY` lives as long as the follower: it attaches to the mesh, requests its status four times a second
 #   until it ends, and attaches again. Everything else is started and stopped from here.
 # * `sample`, one for each run, feeds curves: from the result file, or by questions for what is in no file. It goes on
-#   after the end of the run, since a page may still choose curves from the file, and ends with the next run.
+#   after the end of the run, since a page may still choose curves from the file, and ends with the next run. It also
+#   reads the defects of all of the run, which the file has when it is closed.
 # * `log`, one for each run, collects the log; it ends with the mesh or with its session, so nobody joins it.
 # * Pages: the event loop of the server calls `view`, `log` and `changes`, which take a lock for a moment and never
 #   wait; `ask` and `picture` may take long, and pages call them on other threads.
@@ -305,7 +306,7 @@ class MeshFollower:
 
     def _sample(self, run: Run, info: MeshInfo, ended: threading.Event) -> None:
         path = Path(info.result_file) if info.result_file is not None and info.is_here else None
-        source, looks, closed_at = ResultSource(path), Looks(_SAMPLE_S), math.inf
+        source, looks, until = ResultSource(path), Looks(_SAMPLE_S), math.inf
         try:
             while not (self._closing.is_set() or self._next_run.is_set()):
                 over = ended.is_set()
@@ -313,9 +314,11 @@ class MeshFollower:
                     if source.replaced:
                         return
                     source.read_all(self._held)
-                    closed_at = min(closed_at, time.monotonic() + _CLOSED_S)
-                    if self._view.defects and time.monotonic() < closed_at and (defects := _defects_in(path)):
-                        closed_at = 0.0
+                    until = min(until, time.monotonic() + _CLOSED_S)
+                    # Before, the newest status could still replace those of the file.
+                    has_any = self._view.ended and self._view.defects
+                    if has_any and time.monotonic() < until and (defects := _defects_in(path)):
+                        until = 0.0
                         self._change(defects=defects)
                 else:
                     source.read(self._held, self._forget)

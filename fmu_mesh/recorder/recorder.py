@@ -9,7 +9,7 @@ ahead of the rows that are not written yet than the window of the recorder. So n
 # this thread reads (and the other way round for the progress), and the inbox, into which Zenoh's threads put frames and
 # messages, and the main thread the end of the run (`__exit__`). Only this thread touches the sources and the files
 # until it has ended; then a second one writes what is left and closes them. The main thread reads in which file a
-# write is under way, and for how long (`check_writing`).
+# write is under way, and for how long (`check_writing`), and the newest defects, which this thread replaces as a whole.
 #
 # What may go wrong:
 # * A node could overwrite rows that are not written yet. The windows forbid it, and the stamps of all rows are compared
@@ -332,9 +332,9 @@ class Recorder:
                     self._flushed = now
                     self._note_audit(now)
                     self._files.flush()
-                    if now >= self._defects_due:
+                    if (begun := time.monotonic()) >= self._defects_due:
                         self._newest_defects = largest_defects(self._files.defects, _SHOWN_DEFECTS)
-                        self._defects_due = now + max(_DEFECTS_S, 100.0 * (time.monotonic() - now))
+                        self._defects_due = begun + max(_DEFECTS_S, 100.0 * (time.monotonic() - begun))
                     self._on_flush(self._files.kept)
                     self._router.is_unsteady()  # it notices only what it sees
                 if (wishes := self._wishes()) is None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import fmu_mesh
 from fmu_mesh.errors import ConfigurationError, StepFailed
-from tests.helpers import FMUS, Place
+from tests.helpers import FMUS, Place, wait_until
 
 POINTS = 9000
 FAILING = """
@@ -132,6 +132,24 @@ def test_a_run_from_a_state_compares_from_there_on(tmp_path: Path) -> None:
 
     assert result.defects["v.y -> x.u"].steps == 300
     assert result.defects["v.y -> x.u"].maximum == differences(result["v.y"])[0]
+
+
+def test_the_status_and_graph_of_a_run_have_the_defects_so_far() -> None:
+    so_far = oscillator().run(defects=True, record="memory", stop_time=5.0, processes=False).defects
+
+    with oscillator().start(defects=True, record="memory", paused=True) as run:
+        run.wait_for("paused")
+        run.step(500)
+        shown = wait_until(
+            lambda: found if (found := run.status.defects) and found["v.y -> x.u"].steps == 500 else None,
+            "the defects of these points",
+        )
+        picture = run.graph().svg()
+        run.stop()
+
+    assert shown == so_far
+    assert [*shown] == sorted(shown, key=lambda name: -shown[name].relative)
+    assert f"\nassumed and came differ by at most {so_far['v.y -> x.u'].maximum:.3g} (at t = " in picture
 
 
 def test_without_the_option_nothing_is_compared(tmp_path: Path) -> None:
