@@ -15,6 +15,7 @@ import resource
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -26,7 +27,10 @@ from .. import __version__
 from ..errors import ConfigurationError, FmuMeshError
 from ..files import CACHE_HINT, cache_folder, exists, is_folder
 from ..installing import PROGRAMS, USERS, program, version_of_library
+from ..rings.library import load_library, why_no_library
 from ..run.limits import RUN_MIB, address_space_problem, available_bytes
+from ..web_server import listening
+from ..wire.runtime import runtime_folder
 
 __all__ = ["CheckState", "HostCheck", "HostReport", "report_of_this_host"]
 
@@ -61,8 +65,13 @@ _Check = Callable[[], str | tuple[str, str | None]]
 def report_of_this_host(check_s: float = _CHECK_S) -> HostReport:
     """Look at everything; ``check_s`` is the deadline of each check in s."""
     needed = [_answer(name, check, check_s, "failed") for name, check in _NEEDED.items()]
-    others = [_answer(name, check, check_s, "missing") for name, check in {**_of_kinds(), **_OTHERS}.items()]
-    return HostReport(__version__, int(any(one.state == "failed" for one in needed)), (*needed, *others))
+    others = _OTHERS
+    with suppress(FmuMeshError, ImportError):  # then something that every mesh needs has failed
+        from ..instances.registry import host_checks  # noqa: PLC0415  it needs numpy
+
+        others = {**host_checks(), **_OTHERS}
+    found = [_answer(name, check, check_s, "missing") for name, check in others.items()]
+    return HostReport(__version__, int(any(one.state == "failed" for one in needed)), (*needed, *found))
 
 
 def _answer(name: str, check: _Check, check_s: float, otherwise: CheckState) -> HostCheck:
@@ -71,8 +80,8 @@ def _answer(name: str, check: _Check, check_s: float, otherwise: CheckState) -> 
     def ask() -> None:
         try:
             found = check()
-            state, said = ("ok", (found,)) if isinstance(found, str) else ("limited", found)
-            answers.append(HostCheck(name, state, *said))
+            said = (found,) if isinstance(found, str) else found
+            answers.append(HostCheck(name, "ok" if len(said) == 1 else "limited", *said))
         except FmuMeshError as error:
             answers.append(HostCheck(name, otherwise, error.message, error.hint))
         except Exception as error:  # noqa: BLE001  a broken package must not hide what the other checks find
@@ -96,16 +105,8 @@ def _engine(library: str) -> str:
 
 
 def _library_of_c() -> str | tuple[str, str | None]:
-    from ..rings.library import load_library, why_no_library  # noqa: PLC0415  it may be refused, which is an answer
-
     why = why_no_library()
     return (why, None) if why is not None else f"used: {load_library()}"
-
-
-def _runtime_folder() -> str:
-    from ..wire.runtime import runtime_folder  # noqa: PLC0415  as above
-
-    return str(runtime_folder())
 
 
 def _memory() -> str:
@@ -147,7 +148,6 @@ def _ros() -> str:
 
 
 def _port() -> str | tuple[str, str | None]:
-    from ..web_server import listening  # noqa: PLC0415  as above
     from .processes import PORT  # noqa: PLC0415  as above
 
     try:
@@ -157,21 +157,12 @@ def _port() -> str | tuple[str, str | None]:
     return f"{PORT} of 127.0.0.1 is free"
 
 
-def _of_kinds() -> dict[str, Callable[[], str]]:
-    try:
-        from ..instances.registry import host_checks  # noqa: PLC0415  as above
-
-        return host_checks()
-    except (FmuMeshError, ImportError):  # what every mesh needs has failed
-        return {}
-
-
 _NEEDED: Final[dict[str, _Check]] = {
     "System": _system,
     "Python": lambda: f"{platform.python_version()}, {sys.executable}",
     **{name: partial(_engine, name) for name in ("eclipse-zenoh", "fmpy", "numpy")},
     "Library of C": _library_of_c,
-    "Runtime folder": _runtime_folder,
+    "Runtime folder": lambda: str(runtime_folder()),
     "Memory": _memory,
     "Limits": _limits,
 }

@@ -245,7 +245,10 @@ class FmuKind(Kind[FmuConfig]):
         """Look for the compilers of sources."""
         from .archive.sources import find_compiler  # noqa: PLC0415  as above
 
-        return {f"{of} compiler": lambda of=of: shlex.join(find_compiler(plus=of != "C")) for of in ("C", "C++")}
+        return {
+            "C compiler": lambda: shlex.join(find_compiler(plus=False)),
+            "C++ compiler": lambda: shlex.join(find_compiler(plus=True)),
+        }
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the archive, or of all files of an unpacked FMU."""

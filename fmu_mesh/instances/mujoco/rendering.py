@@ -57,7 +57,7 @@ def check_film(path: Path) -> None:
         raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
         raise ConfigurationError(f"`video={str(path)!r}`: a folder, not a file")
-    require("imageio", "films")
+    require("imageio")
     choose_backend()
 
 

@@ -358,11 +358,7 @@ def _run(path: Path, command: Sequence[str], folder: Path) -> None:
 
 
 def find_compiler(*, plus: bool) -> list[str]:
-    """The command of the C compiler, or of the C++ compiler if ``plus``: ``$CC`` (``$CXX``), or the first one found.
-
-    Raises:
-        LoadFailed: there is none.
-    """
+    """The command of the compiler of C, or of C++: ``$CC`` (``$CXX``), or the first one found; or `LoadFailed`."""
     own = shlex.split(os.environ.get("CXX" if plus else "CC", ""))
     candidates = [own] if own else [[name] for name in (("c++", "g++", "clang++") if plus else ("cc", "gcc", "clang"))]
     for candidate in candidates:
