@@ -87,7 +87,7 @@ def test_a_host_without_something_is_told_the_way_out(name: str, found: str, hin
     assert hint in (check.hint or "")
 
 
-def test_a_missing_program_is_told_as_a_run_tells_it(bare: Path) -> None:
+def test_a_missing_program_has_the_hint_of_a_run(bare: Path) -> None:
     with pytest.raises(ConfigurationError) as caught:
         submitted(bare / "job.sbatch", "#!/bin/sh\n")
 
@@ -107,12 +107,13 @@ def test_programs_that_are_there_are_told_with_their_place(bare: Path) -> None:
     }
 
 
-def test_a_library_that_is_switched_off_is_a_limit_and_no_failure(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("bare")
+def test_a_library_that_is_switched_off_is_a_limit_and_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LIBRARY_VARIABLE, "none")
 
     code, found = doctor()
 
-    assert code == 0, bare
+    assert code == 0
     assert found["Library of C"].state == "limited"
     assert f"not used: the environment variable {LIBRARY_VARIABLE} is none." in found["Library of C"].found
 
@@ -147,7 +148,7 @@ def test_a_runtime_folder_of_everybody_ends_every_mesh_here(
 
 @pytest.mark.usefixtures("bare")
 @pytest.mark.parametrize(("limit", "state"), [("ulimit -v 1500000", "failed"), ("ulimit -n 256", "ok")])
-def test_too_little_address_space_ends_every_mesh_here(limit: str, state: str) -> None:
+def test_limits_of_the_shell_are_told(limit: str, state: str) -> None:
     code, found = doctor("/bin/sh", "-c", f'{limit}; exec "$@"', "sh")
 
     assert (found["Memory"].state, code) == (state, int(state == "failed"))
@@ -222,14 +223,15 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path, monkeypatch: py
     assert cache.found == f"the cache folder '{tmp_path / 'file' / 'cache'}' cannot be written"
 
 
-def test_the_default_port_that_another_program_has_is_told(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("bare")
+def test_the_default_port_that_another_program_has_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         monkeypatch.setattr(processes, "PORT", port)
 
         found = checks()["Default port"]
 
-    assert (found.state, found.found) == ("limited", f"port {port} of 127.0.0.1 is taken by another program."), bare
+    assert (found.state, found.found) == ("limited", f"port {port} of 127.0.0.1 is taken by another program.")
 
 
 @pytest.mark.usefixtures("bare")
