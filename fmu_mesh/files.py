@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 __all__ = [
+    "CACHE_HINT",
     "ELSEWHERE",
     "Kept",
     "OwnFile",
@@ -65,6 +66,7 @@ T = TypeVar("T")
 FileVersion = tuple[int, int, int, int]
 """What changes if a file changes."""
 
+CACHE_HINT = "Set FMU_MESH_CACHE_DIR to a folder that can be written."
 ELSEWHERE = ".elsewhere"
 _DRAFT = ".starting"
 _FICLONE = 0x40049409

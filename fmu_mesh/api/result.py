@@ -476,7 +476,7 @@ def imported_pandas() -> ModuleType:
     Raises:
         LibraryMissing: it is not installed.
     """
-    with importing("pandas", "data frames"):
+    with importing("pandas"):
         import pandas as pd  # noqa: PLC0415  an extra, and slow to import
     module: ModuleType = pd
     return module

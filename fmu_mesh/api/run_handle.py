@@ -289,7 +289,7 @@ class Run:
             CallRefused: too many of them, or none of them, are numbers.
             LibraryMissing: anywidget is not installed.
         """
-        with importing("anywidget", "live cells"):
+        with importing("anywidget"):
             from .live_view import live_view  # noqa: PLC0415  anywidget is an extra
         view = live_view(self._running(), names)
         with self._opening:

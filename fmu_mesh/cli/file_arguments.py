@@ -160,6 +160,7 @@ PARSERS: Parsers = {
             json_switch("JSON, one object for each name"),
         ),
     ),
+    "doctor": (json_switch("JSON, one object with all checks"),),
     "recover": (
         argument("results", "FILE", "the result file, as the run was given it", type=Path),
         QUIET,

@@ -13,7 +13,7 @@ __all__ = ["RUNS"]
 
 
 def _foxglove(arguments: argparse.Namespace) -> int:
-    with importing("foxglove-sdk", "connections of Foxglove"):
+    with importing("foxglove-sdk"):
         from ..foxglove.serving import Serving, serve  # noqa: PLC0415  an extra
     serving = Serving(
         mesh=arguments.mesh,

@@ -42,6 +42,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str, str]]] = {
         "convert a package of SSP into a configuration file, or a mesh into a package",
     ),
     "inspect": ("file", "inspecting", "show the properties of an FMU, or of a package of SSP, without running it"),
+    "doctor": ("file", "doctor", "show what this host can run, and what is missing for the rest"),
     "schema": ("run", "checking", "print the JSON Schema of configurations"),
     "ls": ("mesh", "looking", "list meshes, instances and variables"),
     "status": ("mesh", "looking", "show the state and progress of a mesh or an instance"),

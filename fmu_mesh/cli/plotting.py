@@ -37,7 +37,7 @@ def _plot(arguments: argparse.Namespace) -> int:
     from ..sweeps.sweep_folder import is_sweep  # noqa: PLC0415 the commands that run a mesh need none
     from ..sweeps.sweep_result import SweepResult  # noqa: PLC0415 as above
 
-    require("matplotlib", "plots")
+    require("matplotlib")
     first, *others = arguments.results
     sweeps = [str(path) for path in arguments.results if is_sweep(path)]
     of_curves = arguments.x or arguments.difference or arguments.title
@@ -93,7 +93,7 @@ def check_plot(plot: Path, plan: RunPlan | None = None) -> None:
     Raises:
         ConfigurationError: matplotlib is not installed, it has no such format, or the result cannot be drawn.
     """
-    require("matplotlib", "plots")
+    require("matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
 
     formats = FigureCanvasAgg.get_supported_filetypes()
@@ -138,7 +138,7 @@ def plotted_where_it_ends(plan: Plan, plot: Path | None) -> Iterator[None]:
 
 def _compare(arguments: argparse.Namespace) -> int:
     if arguments.plot is not None:
-        require("matplotlib", "plots")
+        require("matplotlib")
     first, second = (Result(path.stem, file=path) for path in (arguments.first, arguments.second))
     comparison = first.compare(second, rtol=arguments.rtol, atol=arguments.atol, variables=tuple(arguments.variables))
     code = 0 if comparison.equal else _DIFFERENT

@@ -49,7 +49,7 @@ def serve(options: ServedMesh, ready: Callable[[str], None]) -> None:
         ConfigurationError: NiceGUI is not installed, the port is taken, or the mesh does not run.
         DeadlineExceeded: an endpoint does not answer.
     """
-    require("nicegui", "dashboards")
+    require("nicegui")
     with (
         listening(options.host, options.port, "the dashboard") as listener,
         MeshDirectory(options.mesh, options.reach) as directory,

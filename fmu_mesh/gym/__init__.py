@@ -11,7 +11,7 @@ It needs the library gymnasium, which `import fmu_mesh` does not import (docs/le
 
 from ..installing import importing
 
-with importing("gymnasium", "environments of Gymnasium"):
+with importing("gymnasium"):
     from .environments import MeshEnv, MeshVectorEnv
 from .task import Step, Task
 

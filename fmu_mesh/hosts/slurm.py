@@ -19,6 +19,7 @@ import msgspec
 
 from ..errors import ConfigurationError, DeadlineExceeded, FmuMeshError
 from ..files import write_whole
+from ..installing import PROGRAMS
 
 __all__ = [
     "COMPLETED",
@@ -211,8 +212,8 @@ def _run(command: Sequence[str], deadline_s: float, *, folder: Path | None = Non
             process_group=0,
         )
     except OSError as error:
-        hint = "Install the programs of Slurm (Debian, Ubuntu: apt install slurm-client), or run this on a login host."
-        raise ConfigurationError(f"`{command[0]}` cannot be started: {error.strerror}", hint=hint) from error
+        text, (_, hint) = f"`{command[0]}` cannot be started: {error.strerror}", PROGRAMS["sbatch"]
+        raise ConfigurationError(text, hint=hint) from error
     with child:
         try:
             output, errors = child.communicate(timeout=deadline_s)

@@ -29,7 +29,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from shutil import which
 from typing import Final, TypeVar
 
 import msgspec
@@ -40,6 +39,7 @@ from ..awake import AwakeClock
 from ..config.instance_sections import PhysicsSection
 from ..errors import ConfigurationError, FmuMeshError, MeshLost
 from ..files import beside
+from ..installing import program
 from ..run.child import how_it_ended
 from ..run.process import launch_of
 from ..run.run_plan import RunPlan, encoded, in_parts
@@ -100,9 +100,7 @@ class SshHosts:
     """
 
     def __init__(self, run: RunPlan, folder: Path, post: Post, tell: Callable[[str, str], None]) -> None:
-        if which("ssh") is None:
-            hint = "Install it, on Debian with `apt install openssh-client`."
-            raise ConfigurationError("there is no `ssh` on this host, and the mesh has nodes on others", hint=hint)
+        program("ssh")
         items = [item for node in run.plan.nodes.values() if node.host in run.plan.hosts for item in node.instances]
         if run.showing and (away := [item.name for item in items if isinstance(item.section, PhysicsSection)]):
             raise ConfigurationError(f"the world of '{away[0]}' cannot be shown: it is not on the host of `launch`")

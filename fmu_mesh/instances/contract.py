@@ -119,8 +119,7 @@ class Opening(msgspec.Struct, Generic[Section], frozen=True):
 class Kind(ABC, Generic[Section]):
     """A kind of instances: what its section of a configuration may say, and how its models are described and opened.
 
-    An entry point of the group `fmu_mesh.instances` names an object of such a class; its name is the key of the kind in
-    a configuration.
+    An entry point of the group `fmu_mesh.instances` names an object of such a class; its name is the key of the kind.
 
     Call sequence, in the process that plans a run: `check_showing` if somebody wants to see the world, then `describe`
     for each model and `content` for each file; `check_engine` and `check_model` only for `fmu-mesh check`. Then `open`
@@ -197,6 +196,10 @@ class Kind(ABC, Generic[Section]):
         Raises:
             LoadFailed: it cannot; says why, with a hint what to install.
         """
+
+    def host_checks(self) -> Mapping[str, Callable[[], str]]:
+        """What `doctor` looks for, by name: each returns what is here, or raises as `check_engine`; starts nothing."""
+        return {}
 
     def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
         """Check that this host has what one model needs; nothing is checked by default.

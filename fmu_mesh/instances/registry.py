@@ -39,6 +39,7 @@ __all__ = [
     "describe",
     "expected_model",
     "files_of",
+    "host_checks",
     "needs_compiler",
     "open_instance",
     "preload",
@@ -196,6 +197,17 @@ def check_engines(
                 expected = f"{needed}, or the `host` of the instance. {reason.hint or ''}".rstrip()
                 findings.add(f"instances.{name}.{key}", reason.message, expected)
                 break
+
+
+def host_checks() -> dict[str, Callable[[], str]]:
+    """What all installed kinds look for on this host, by its name; see `Kind.host_checks`."""
+    found: dict[str, Callable[[], str]] = {}
+    for key in _names():
+        try:
+            found.update(_kind(key).host_checks())
+        except ConfigurationError:  # its package is broken, and says so when it is asked again
+            found[f"Kind '{key}'"] = partial(lambda key: str(_kind(key)), key)
+    return found
 
 
 def check_showing(sections: Mapping[str, InstanceSection], showing: Showing) -> None:

@@ -138,7 +138,7 @@ def empty_figure() -> Figure:
     Raises:
         ConfigurationError: matplotlib is not installed.
     """
-    require("matplotlib", "plots")
+    require("matplotlib")
     # The object interface: no window, no global state of pyplot.
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  matplotlib is an extra, and slow to import
 

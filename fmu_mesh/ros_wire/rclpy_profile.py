@@ -17,7 +17,12 @@ from ..wire.views import RosTopicView
 from .profile import Put, Take
 from .topics import Topic
 
-__all__ = ["RclpyProfile", "RosNode", "message_class", "ros_module"]
+__all__ = ["HOW_TO_GET_ROS", "RclpyProfile", "RosNode", "message_class", "ros_module"]
+
+HOW_TO_GET_ROS = (
+    "Source your ROS first (`source /opt/ros/DISTRO/setup.bash`) and use its Python; the package has to be installed "
+    "there."
+)
 
 RosNode = Any
 """`rclpy.node.Node`, which has no types where ROS is not installed."""
@@ -35,8 +40,7 @@ def ros_module(name: str) -> Any:  # noqa: ANN401 a module of ROS has no types w
         package = name.partition(".")[0]
         raise ConfigurationError(
             f"the ROS package '{package}' cannot be imported: {error}.",
-            hint="Source your ROS first (`source /opt/ros/DISTRO/setup.bash`) and use its Python; the package has to "
-            "be installed there.",
+            hint=HOW_TO_GET_ROS,
         ) from error
 
 

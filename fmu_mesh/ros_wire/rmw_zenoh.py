@@ -130,7 +130,7 @@ class RmwZenoh(ZenohProfile):
         return f"@ros2_lv/{self._domain}/{self._session.zid()}/0/{next(self._entities)}/{kind}/{self._node}/{own}"
 
     def _attached(self, token: str) -> Callable[[float], bytes | None]:
-        with importing("xxhash", "topics of rmw_zenoh"):
+        with importing("xxhash"):
             import xxhash  # noqa: PLC0415  an optional dependency
 
         number = xxhash.xxh3_128_intdigest(token.encode())

@@ -27,6 +27,7 @@ __all__ = [
     "FEWEST_MIB",
     "RUN_MIB",
     "address_space_problem",
+    "available_bytes",
     "limit_process",
     "memory_share",
     "needed_mib",
@@ -45,7 +46,7 @@ _LOCAL_MIB = 660
 """Need of a run in one process. Measured: 630."""
 RUN_MIB = 1700
 """Need of a master, a node, and of what starts them. Measured: 1540, of which about a tenth is used."""
-_WITHOUT_SESSION = ("check", "completion", "inspect", "new", "plot", "schema")
+_WITHOUT_SESSION = ("check", "completion", "doctor", "inspect", "new", "plot", "schema")
 _RUNS = ("launch", "run", "node", "master", "gateway")
 _SWEEP = "sweep"
 _NEARLY = 0.9
@@ -106,7 +107,7 @@ def ring_problem(rings: Mapping[str, tuple[int, int]]) -> ConfigurationError | N
         rings: number of rows, and size of a row in bytes, by instance.
     """
     sizes = {name: rows * size for name, (rows, size) in rings.items()}
-    needed, available = sum(sizes.values()), _available()
+    needed, available = sum(sizes.values()), available_bytes()
     if available is None or needed <= available:
         return None
     name = max(sizes, key=sizes.__getitem__)
@@ -181,7 +182,7 @@ def _data_bytes(process: str) -> int:
     return int(Path(f"/proc/{process}/status").read_text(encoding="ascii").partition("VmData:")[2].split()[0]) << 10
 
 
-def _available() -> int | None:
+def available_bytes() -> int | None:
     """The memory in bytes that processes can get here: of the host, or of its control group; None: not known."""
     found = []
     with suppress(OSError):

@@ -35,7 +35,7 @@ from ..wire.host_processes import STATES, Answered, Asked, is_alive, is_stopped
 from ..wire.runtime import box_of, runtime_folder
 from .threads import ONE_THREAD
 
-__all__ = ["Sandboxed", "why_no_sandbox"]
+__all__ = ["Sandboxed", "why_no_bubblewrap", "why_no_sandbox"]
 
 _LINKS: Final = ("/bin", "/sbin", "/lib", "/lib32", "/lib64")
 _SYSTEM: Final = (
@@ -50,6 +50,7 @@ _VARIABLES: Final = ("PATH", "LANG", "TZ", "CC", "CXX", "LD_LIBRARY_PATH", "LC_"
 _TEMPORARY: Final = "/tmp"  # noqa: S108  that of the sandbox is its own
 _APART: Final = ("--unshare-all", "--die-with-parent", "--proc", "/proc", "--dev", "/dev", "--tmpfs", _TEMPORARY)
 _MEMORY: Final = "/memfd:fmu_mesh"
+_TRY_S: Final = 5.0
 _SIGNALLED: Final = 128
 """bubblewrap adds this to the number of the signal that has ended what it runs."""
 _CREDENTIALS: Final = struct.Struct("3i")
@@ -69,10 +70,20 @@ def why_no_sandbox(zenoh: ZenohConfig, sandboxed: Mapping[str, bool]) -> tuple[s
         )
     if (other := next((name for name, is_elsewhere in sandboxed.items() if is_elsewhere), None)) is not None:
         return f"a sandbox for '{other}', which has a `host` or an `interpreter`", "an instance without"
+    return why_no_bubblewrap()
+
+
+def why_no_bubblewrap() -> tuple[str, str] | None:
+    """Why no sandbox can be made here, and what to do; None: one was made."""
     if (program := shutil.which("bwrap")) is None:
         return "bubblewrap, which is not installed", "`apt-get install bubblewrap`, or `sandbox: none`"
     command = [program, *_APART, *_system(), "true"]
-    tried = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, text=True)
+    try:
+        tried = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, check=False, text=True, timeout=_TRY_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"bubblewrap, which has not answered for {_TRY_S:g} s", "a host where it works, or `sandbox: none`"
     if tried.returncode != 0:
         said = (tried.stderr.strip().splitlines() or ["no message"])[-1]
         return f"bubblewrap, which does not work here: {said}", "a host that allows user namespaces, or `sandbox: none`"

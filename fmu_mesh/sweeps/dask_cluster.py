@@ -36,7 +36,7 @@ def dask_executor(address: str | None, workers: int | None = None) -> Iterator[E
         LibraryMissing: Dask is not installed.
         MeshLost: the scheduler does not answer.
     """
-    with importing("distributed", "clusters of Dask"):
+    with importing("distributed"):
         from dask import config as dask_config  # noqa: PLC0415  an extra, and slow to import
         from distributed import Client, LocalCluster  # noqa: PLC0415  as above
         from distributed.security import Security  # noqa: PLC0415  as above

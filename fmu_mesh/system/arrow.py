@@ -43,7 +43,7 @@ def pyarrow_module() -> Any:  # noqa: ANN401  an optional dependency
     Raises:
         LibraryMissing: it is not installed.
     """
-    with importing("pyarrow", "results in .parquet"):
+    with importing("pyarrow"):
         import pyarrow as pa  # noqa: PLC0415  an optional dependency
         from pyarrow import ipc  # noqa: F401, PLC0415  an optional dependency; `pa.ipc`
     return pa

@@ -157,7 +157,7 @@ def test_what_nobody_records_does_not_narrow_the_recorder(tmp_path: Path) -> Non
 
 
 def test_check_and_launch_say_which_ring_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(limits, "_available", lambda: 50_000_000)
+    monkeypatch.setattr(limits, "available_bytes", lambda: 50_000_000)
     mesh = mesh_of(tmp_path, 100_000)
 
     checked = mesh.check()

@@ -59,7 +59,7 @@ def test_a_library_of_another_package_is_named_as_it_is() -> None:
 
 def test_a_missing_library_is_a_configuration_error_of_a_model_too() -> None:
     with pytest.raises(LibraryMissing) as caught:
-        require("no_such_module", "films")
+        require("no_such_module")
 
     assert isinstance(caught.value, ConfigurationError)
     assert isinstance(caught.value, LoadFailed)

@@ -6,7 +6,8 @@ The code that reads, loads and calls FMUs is imported when it is used.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -239,6 +240,15 @@ class FmuKind(Kind[FmuConfig]):
 
         if description.library and (missing := missing_libraries(path, description.library, Terms(limits))):
             raise LoadFailed("; ".join(missing))
+
+    def host_checks(self) -> Mapping[str, Callable[[], str]]:
+        """Look for the compilers of sources."""
+        from .archive.sources import find_compiler  # noqa: PLC0415  as above
+
+        return {
+            "C compiler": lambda: shlex.join(find_compiler(plus=False)),
+            "C++ compiler": lambda: shlex.join(find_compiler(plus=True)),
+        }
 
     def content(self, path: Path) -> str:
         """A SHA-256 of the archive, or of all files of an unpacked FMU."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shlex
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
@@ -36,18 +38,30 @@ class GazeboClassicKind(Kind[GazeboClassicConfig]):
 
     def check_engine(self) -> None:
         """Check that Gazebo classic runs on this host."""
-        from .gazebo_process import HOW_TO_GET_IT, GazeboGone, check_program  # noqa: PLC0415  as above
+        from .gazebo_process import check_program  # noqa: PLC0415  as above
 
-        try:
-            check_program()
-        except GazeboGone as error:
-            raise LoadFailed(f"Gazebo classic does not run on this host: {error}", hint=HOW_TO_GET_IT) from error
+        _asked(check_program)
+
+    def host_checks(self) -> Mapping[str, Callable[[], str]]:
+        """Look for the lock-step program; it is not started."""
+        from .gazebo_process import find_program  # noqa: PLC0415  as above
+
+        return {"Gazebo classic": lambda: shlex.join(_asked(find_program))}
 
     def open(self, opening: Opening[GazeboClassicConfig]) -> Instance:
         """Start Gazebo with the world."""
         from .gazebo_classic import GazeboClassicInstance  # noqa: PLC0415  as above
 
         return GazeboClassicInstance(opening.path, opening.name, opening.section, opening.timeouts)
+
+
+def _asked(ask: Callable[[], Any]) -> Any:  # noqa: ANN401  what `ask` returns
+    from .gazebo_process import HOW_TO_GET_IT, GazeboGone  # noqa: PLC0415  as above
+
+    try:
+        return ask()
+    except GazeboGone as error:
+        raise LoadFailed(f"Gazebo classic does not run on this host: {error}", hint=HOW_TO_GET_IT) from error
 
 
 KIND_OF_GAZEBO_CLASSIC = GazeboClassicKind()  # what the entry point `gazebo_classic` names

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -53,6 +53,12 @@ class MujocoKind(Kind[MujocoConfig]):
             check_window()
         if showing.video is not None:
             check_film(showing.video)
+
+    def host_checks(self) -> Mapping[str, Callable[[], str]]:
+        """Look for what draws films."""
+        from .rendering import choose_backend  # noqa: PLC0415  as above
+
+        return {"OpenGL": choose_backend}
 
     def open(self, opening: Opening[MujocoConfig]) -> Instance:
         """Load the world, and start a film or a window if one is asked for."""

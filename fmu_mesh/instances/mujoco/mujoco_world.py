@@ -108,7 +108,7 @@ def load_world(path: Path, config: MujocoConfig) -> World:
 
 def engine() -> ModuleType:
     """The module `mujoco`; it is imported on first use, because it is optional and slow to import."""
-    with importing("mujoco", "worlds of MuJoCo"):
+    with importing("mujoco"):
         import mujoco  # noqa: PLC0415  an extra, and slow to import
     mujoco.set_mju_user_warning(warnings.append)
     module: ModuleType = mujoco

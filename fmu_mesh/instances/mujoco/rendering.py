@@ -22,7 +22,7 @@ from ...errors import ConfigurationError, LoadFailed
 from ...installing import require
 from .mujoco_world import engine
 
-__all__ = ["Film", "Picture", "Window", "check_film", "check_window"]
+__all__ = ["Film", "Picture", "Window", "check_film", "check_window", "choose_backend"]
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +57,8 @@ def check_film(path: Path) -> None:
         raise ConfigurationError(f"`video={str(path)!r}`: a film is one of {', '.join(FILM_RATES)}")
     if files.is_folder(path):
         raise ConfigurationError(f"`video={str(path)!r}`: a folder, not a file")
-    require("imageio", "films")
-    _choose_backend()
+    require("imageio")
+    choose_backend()
 
 
 def check_window() -> None:
@@ -85,7 +85,7 @@ class Film(Picture):
         self._has_moved = False
         self._renderer: Any = None
         self._writer: Any = None
-        _choose_backend()
+        choose_backend()
 
     def show(self, model: Any, data: Any, time_s: float) -> None:  # noqa: ANN401  mujoco has no types
         """Add as many pictures as the time since the last one asks for."""
@@ -190,13 +190,13 @@ class Window(Picture):
                 self._viewer.close()
 
 
-def _choose_backend() -> None:
+def choose_backend() -> str:
     """Let MuJoCo render without a screen, unless the user has chosen a backend; before `mujoco` is imported."""
-    if os.environ.get("MUJOCO_GL"):
-        return
+    if chosen := os.environ.get("MUJOCO_GL"):
+        return chosen
     for backend, library in _BACKENDS:
         if ctypes.util.find_library(library) is not None:
             os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
-            return
+            return backend
     hint = "Install one of them, for example with `apt install libegl1` or `apt install libosmesa6`."
     raise ConfigurationError("films need OpenGL without a screen: neither EGL nor OSMesa is installed.", hint=hint)

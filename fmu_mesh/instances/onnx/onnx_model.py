@@ -156,7 +156,7 @@ def _read(path: Path, limits: LimitsConfig) -> bytes:
 def _engine() -> ModuleType:
     # Some releases send usage data to their vendor, with threads and files of their own. Who wants that says so.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-    with importing("onnxruntime", "ONNX models"):
+    with importing("onnxruntime"):
         import onnxruntime  # noqa: PLC0415  an extra, and slow to import
     module: ModuleType = onnxruntime
     return module

@@ -62,7 +62,7 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        with importing("rosbags", "bags of ROS"):
+        with importing("rosbags"):
             from rosbags.rosbag2 import Reader  # noqa: PLC0415 an optional dependency
         self.path = path
         if not files.exists(path):

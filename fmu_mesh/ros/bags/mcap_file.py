@@ -335,6 +335,6 @@ def _published_topic(topic: Topic, types: MessageTypes) -> Topic | None:
 
 
 def _writer_class() -> Any:  # noqa: ANN401 a class of an optional dependency
-    with importing("mcap", "recordings into .mcap"):
+    with importing("mcap"):
         from mcap.writer import Writer  # noqa: PLC0415 an optional dependency
     return Writer

@@ -29,7 +29,7 @@ from ...text import did_you_mean, short_path
 from .certificates import called
 from .identity import CA, CA_KEY, CERTIFICATE, KEY, ROLES, Role, RoleTable, wrong_name
 
-with importing("cryptography", "certificates"):
+with importing("cryptography"):
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric import ec

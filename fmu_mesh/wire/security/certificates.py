@@ -20,7 +20,7 @@ from ...installing import importing
 from ...text import listed, short_path, shown
 from .identity import CA, CA_KEY, CERTIFICATE, KEY, ROLES, Identity, Role, RoleTable, wrong_name
 
-with importing("cryptography", "certificates"):
+with importing("cryptography"):
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ec import ECDSA, EllipticCurvePublicKey
     from cryptography.hazmat.primitives.hashes import SHA256

@@ -37,7 +37,7 @@ from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
 
-__all__ = ["describe", "extract", "needs_compiler", "prepare"]
+__all__ = ["describe", "extract", "find_compiler", "needs_compiler", "prepare"]
 
 log = logging.getLogger(__name__)
 
@@ -283,7 +283,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     except OSError as error:
         raise LoadFailed(
             f"the sources of '{path}' cannot be compiled into '{target.parent}': {error.strerror or error}",
-            hint="Set FMU_MESH_CACHE_DIR to a folder that can be written.",
+            hint=files.CACHE_HINT,
         ) from error
     return target
 
@@ -291,7 +291,11 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
 def _command(path: Path, sources: Path, build: _Build) -> tuple[list[str], Path]:
     """How sources are compiled, without their names, and where in the cache their library is."""
     plus = any(not name.endswith(".c") for name in build.sources)
-    compiler = _compiler(path, plus=plus)
+    try:
+        compiler = find_compiler(plus=plus)
+    except LoadFailed as error:
+        text = f"'{path}' has no binary for this platform ({fmpy.platform}) but sources, and {error.message}."
+        raise LoadFailed(text, hint=error.hint) from None
     own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
     target = (
         files.cache_folder()
@@ -353,16 +357,15 @@ def _run(path: Path, command: Sequence[str], folder: Path) -> None:
         )
 
 
-def _compiler(path: Path, *, plus: bool) -> list[str]:
-    """The command of the C compiler, or of the C++ compiler if ``plus``: ``$CC`` (``$CXX``), or the first one found."""
+def find_compiler(*, plus: bool) -> list[str]:
+    """The command of the compiler of C, or of C++: ``$CC`` (``$CXX``), or the first one found; or `LoadFailed`."""
     own = shlex.split(os.environ.get("CXX" if plus else "CC", ""))
     candidates = [own] if own else [[name] for name in (("c++", "g++", "clang++") if plus else ("cc", "gcc", "clang"))]
     for candidate in candidates:
         if found := shutil.which(candidate[0]):
             return [found, *candidate[1:]]
     raise LoadFailed(
-        f"'{path}' has no binary for this platform ({fmpy.platform}) but sources, and there is no compiler "
-        f"(looked for {', '.join(candidate[0] for candidate in candidates)}).",
+        f"there is no compiler (looked for {', '.join(candidate[0] for candidate in candidates)})",
         hint=f"Install one, name it in ${'CXX' if plus else 'CC'}, or export the FMU with a binary for this platform.",
     )
 
