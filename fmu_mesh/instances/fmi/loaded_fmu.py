@@ -156,6 +156,7 @@ class LoadedFmu:
                 guid=description.guid,
                 modelIdentifier=description.model_identifier,
                 unzipDirectory=str(self._folder),
+                libraryPath=str(path),
                 instanceName=self._fmu.name,
             )
 

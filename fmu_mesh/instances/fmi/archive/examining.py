@@ -26,7 +26,7 @@ __all__ = ["examine", "find_library", "library_folders", "library_name", "names_
 _SHOWN: Final = 3
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
 
-_ARM: Final = ("aarch64-linux", "aarch64-linux-gnu", "linux64")
+_ARM: Final = "aarch64-linux"
 _PROCESSORS: Final = {62: "x86_64", 183: "aarch64"}
 """What ELF calls them."""
 
@@ -81,10 +81,10 @@ def _what_it_is(path: Path, names: Collection[str]) -> str:
 def library_folders(fmi_version: str) -> tuple[str, ...]:
     """What FMUs call this platform, the name of the standard first (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1).
 
-    For ARM, FMI 2.0 takes the name of FMI 3.0. OpenModelica writes that of Debian, or `linux64` on ARM itself.
+    For ARM, FMI 2.0 takes the name of FMI 3.0. OpenModelica writes that of Debian, or on ARM itself `linux64`.
     """
-    if fmpy.platform_tuple == _ARM[0]:
-        return _ARM
+    if fmpy.platform_tuple == _ARM and not fmi_version.startswith("3"):
+        return _ARM, f"{_ARM}-gnu", "linux64"
     return (fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform,)
 
 
