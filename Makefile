@@ -53,7 +53,7 @@ bench: $(VENV)/.installed-test ## us and the peers on this machine, and topics o
 fmus: $(VENV)/.installed-plot ## rebuild the example FMUs from fmus/src (needs a C compiler)
 	@$(BIN)/python fmus/build.py
 
-library: $(VENV)/.installed-library ## rebuild the library of C from its sources (installs a compiler into .venv)
+library: $(VENV)/.installed-library ## rebuild the libraries of C from their sources (installs a compiler into .venv)
 	@$(BIN)/python build_library.py
 
 clean: ## remove results, builds and caches, but not .venv

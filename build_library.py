@@ -1,10 +1,10 @@
 """Builds the library of C that steps a mesh, and puts it into the wheel.
 
-The library for Linux on x86_64 is kept in the repository and in the source distribution, so that nobody needs a
-compiler. It is built by the C compiler of the Python package ziglang, in the version that `pyproject.toml` pins. So the
-same sources give the same bytes on every machine, and everybody can compare.
+The libraries for Linux on x86_64 and on aarch64 are kept in the repository and in the source distribution, so that
+nobody needs a compiler. They are built by the C compiler of the Python package ziglang, in the version that
+`pyproject.toml` pins. So the same sources give the same bytes on every machine, and everybody can compare.
 
-The library contains the SHA-256 of each of its sources (`fmu_mesh/rings/library.py` compares them when it loads it).
+A library contains the SHA-256 of each of its sources (`fmu_mesh/rings/library.py` compares them when it loads it).
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ SOURCES: Final = (
 TARGETS: Final = {"linux-x86_64": "x86_64-linux-gnu.2.17", "linux-aarch64": "aarch64-linux-gnu.2.17"}
 """What ziglang calls a platform. With glibc 2.17 the library runs on all Linux systems since 2014, except musl's."""
 
-WHEEL: Final = ("linux-x86_64", "manylinux_2_17_x86_64")
-"""The platform whose library is in the wheel, and its name in the name of the wheel."""
+WHEELS: Final = {"linux-x86_64": "manylinux_2_17_x86_64", "linux-aarch64": "manylinux_2_17_aarch64"}
+"""What the name of a wheel calls a platform whose library it has."""
 
 FLAGS: Final = (
     "-std=c11",
@@ -60,6 +60,7 @@ FLAGS: Final = (
     "-Wl,--no-undefined",
     "-Wall",
     "-Wextra",
+    "-Watomic-implicit-seq-cst",  # an access of an atomic names its memory order
     "-Werror",
 )
 
@@ -128,9 +129,9 @@ def build(platform: str) -> bytes:
 
 
 class WheelHook(BuildHookInterface[Any]):
-    """Puts the library into a wheel for Linux on x86_64.
+    """Puts the library of its platform into a wheel: of this one, or that which `_PYTHON_HOST_PLATFORM` names.
 
-    A wheel that is built on another system has no library and is for all systems: there, a mesh runs without it.
+    A wheel for another system has no library and is for all systems: there, a mesh runs without it.
     """
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
@@ -139,40 +140,40 @@ class WheelHook(BuildHookInterface[Any]):
         Raises:
             BuildError: the library is missing, or was built from other sources.
         """
-        platform, tag = WHEEL
-        if version != "standard" or tag not in platform_tags():
+        tags = {*platform_tags()}
+        platform = next((name for name, tag in WHEELS.items() if tag in tags), None)
+        if version != "standard" or platform is None:
             return
         library = library_path(platform)
         if not library.is_file() or manifest().encode() not in library.read_bytes():
             raise BuildError(f"{library} is missing, or was built from other sources: make library")
         build_data["force_include"][str(library)] = library.relative_to(ROOT).as_posix()
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{tag}"
+        build_data["tag"] = f"py3-none-{WHEELS[platform]}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build the library, or compare the one that is there."""
+    """Build the libraries, or compare those that are there."""
     parser = argparse.ArgumentParser(description="Build the library of C that steps a mesh.")
-    parser.add_argument(
-        "--platform", choices=TARGETS, default=WHEEL[0], help="what to build it for (default: %(default)s)"
-    )
-    parser.add_argument("--check", action="store_true", help="write nothing; fail if the library has other bytes")
+    parser.add_argument("--platform", choices=TARGETS, help="what to build it for (default: all)")
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a library has other bytes")
     options = parser.parse_args(arguments)
-    path = library_path(options.platform)
-    try:
-        built = build(options.platform)
-    except BuildError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    if not options.check:
-        # A new file: a process that has loaded the old one keeps it.
-        draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-        draft.write_bytes(built)
-        draft.replace(path)
-    elif not path.is_file() or path.read_bytes() != built:
-        print(f"error: {path} is not what its sources give: make library", file=sys.stderr)
-        return 1
-    print(f"{path.relative_to(ROOT)} ({len(built)} bytes, SHA-256 {hashlib.sha256(built).hexdigest()})")
+    for platform in [options.platform] if options.platform else TARGETS:
+        path = library_path(platform)
+        try:
+            built = build(platform)
+        except BuildError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+        if not options.check:
+            # A new file: a process that has loaded the old one keeps it.
+            draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+            draft.write_bytes(built)
+            draft.replace(path)
+        elif not path.is_file() or path.read_bytes() != built:
+            print(f"error: {path} is not what its sources give: make library", file=sys.stderr)
+            return 1
+        print(f"{path.relative_to(ROOT)} ({len(built)} bytes, SHA-256 {hashlib.sha256(built).hexdigest()})")
     return 0
 
 

@@ -22,7 +22,7 @@ import uuid
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 __all__ = ["BuildError", "build", "find_compiler"]
@@ -46,27 +46,38 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Platform:
-    """What FMI 2.0, 2.3 and FMI 3.0, 2.5.1.4 call a platform, and how to link a shared library there."""
+    """What FMI 2.0, 2.3 and FMI 3.0, 2.5.1.4 call a platform, and how to link a shared library there.
+
+    Attributes:
+        compiler: what builds for it on another platform; empty: `find_compiler`.
+    """
 
     name: str
     name_in_fmi3: str
     suffix: str
     link_flags: tuple[str, ...]
+    compiler: tuple[str, ...] = ()
 
 
 LINUX = Platform(
     "linux64", "x86_64-linux", ".so", ("-fPIC", "-shared", "-s", "-Wl,--build-id=none", "-Wl,--no-undefined")
 )
+ARM = Platform("aarch64-linux", "aarch64-linux", ".so", LINUX.link_flags)
+ARM_FROM_X86 = replace(
+    ARM, compiler=(sys.executable, "-m", "ziglang", "cc", "-target", "aarch64-linux-gnu.2.17", "-mcpu=baseline")
+)
+"""By the compiler that also builds the library of the mesh (`make library` installs it)."""
 MACOS = Platform("darwin64", "x86_64-darwin", ".dylib", ("-fPIC", "-dynamiclib", "-Wl,-x"))
 WINDOWS = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s", "-static-libgcc"))
 
 
-def build(model_dir: Path, output_dir: Path) -> Path:
+def build(model_dir: Path, output_dir: Path, platform: Platform | None = None) -> Path:
     """Build the FMU of the model in ``model_dir``.
 
     Args:
         model_dir: the folder with ``modelDescription.xml`` and the model's C files.
         output_dir: where ``<modelIdentifier>.fmu`` goes; made if missing.
+        platform: of its library; without one, it is this platform, and the sources are in the FMU, too.
 
     Returns:
         The path of the FMU.
@@ -84,9 +95,9 @@ def build(model_dir: Path, output_dir: Path) -> Path:
     sources["fmu_guid.h"] = f'#define FMU_GUID "{guid}"\n'.encode()
     sources |= fmi_headers(version)
 
-    platform = this_platform()
+    members = {f"sources/{name}": content for name, content in sources.items()} if platform is None else {}
+    platform = platform or this_platform()
     library = compile_library(identifier, source_names, sources, platform)
-    members = {f"sources/{name}": content for name, content in sources.items()}
     members["modelDescription.xml"] = template.replace(GUID_PLACEHOLDER, guid).encode()
     platform_name = platform.name_in_fmi3 if version == "3" else platform.name
     members[f"binaries/{platform_name}/{identifier}{platform.suffix}"] = library
@@ -175,14 +186,16 @@ def this_platform() -> Platform:
         raise BuildError("only 64-bit platforms are known")
     if sys.platform == "darwin":
         return MACOS
-    return WINDOWS if sys.platform == "win32" else LINUX
+    if sys.platform == "win32":
+        return WINDOWS
+    return ARM if os.uname().machine == "aarch64" else LINUX
 
 
 def compile_library(
     identifier: str, source_names: Sequence[str], sources: dict[str, bytes], platform: Platform
 ) -> bytes:
     """Compile the C files to a shared library and return its bytes."""
-    compiler = find_compiler()
+    compiler = platform.compiler or find_compiler()
     with tempfile.TemporaryDirectory(prefix="fmu_build_") as folder:
         for name, content in sources.items():
             Path(folder, name).write_bytes(content)
@@ -215,10 +228,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("models", nargs="*", help="names of model folders (default: all)")
     parser.add_argument("--source", type=Path, default=HERE / "src", help="folder of the model folders")
     parser.add_argument("--output", type=Path, default=HERE, help="folder for the .fmu files")
+    parser.add_argument("--arm", action="store_true", help="for Linux on ARM only, without sources; needs ziglang")
     options = parser.parse_args(arguments)
     try:
         for model_dir in model_dirs(options.source, options.models):
-            path = build(model_dir, options.output)
+            path = build(model_dir, options.output, ARM_FROM_X86 if options.arm else None)
             print(f"{path} ({path.stat().st_size} bytes)")
     except BuildError as error:
         print(f"error: {error}", file=sys.stderr)

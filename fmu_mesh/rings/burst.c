@@ -42,6 +42,13 @@
  * wake_at without the fence: a sleeper that it misses is seen after the next step. With the fence it looks at the end
  * of a burst and before it waits itself. Every sleep has a time limit. docs/rings.md explains the protocol;
  * tests/property/test_waiting.py explores it.
+ *
+ * Memory orders. Each access of an atomic names its order, because ARM delays what x86 does not (the compiler refuses
+ * implicit accesses, and tests/unit/test_library.py the functions without an order):
+ *
+ *   release, acquire   a number, and what was written before it: counters, stamps, states
+ *   seq_cst            two sides that each store, and then load what the other one stores: wake_at, needs, bells
+ *   relaxed            a fence is beside it, or the number only says when to look again
  */
 #define _GNU_SOURCE
 #include <fenv.h>
@@ -59,7 +66,7 @@ PUBLIC void ring_bell(Bell *bell) { ring(bell); }
 
 /* Raise a counter, and wake who needs it: for Python. */
 PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
-  if (value <= atomic_load(&counter->value)) return;
+  if (value <= atomic_load_explicit(&counter->value, memory_order_relaxed)) return; /* only this thread raises it */
   atomic_store_explicit(&counter->value, value, memory_order_release);
   atomic_thread_fence(memory_order_seq_cst);
   wake_if_needed(place, counter);
@@ -69,10 +76,10 @@ PUBLIC void counter_raise(const Place *place, Counter *counter, int64_t value) {
  * pause there. A node claims, has a fence, and reads the grant; this is the other side. */
 PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) {
   int64_t most = 0;
-  atomic_store(&grant->value, 0);
+  atomic_store_explicit(&grant->value, 0, memory_order_relaxed);
   atomic_thread_fence(memory_order_seq_cst);
   for (int64_t i = 0; i < n; i++) {
-    int64_t claimed = atomic_load(&nodes[i]->claimed);
+    int64_t claimed = atomic_load_explicit(&nodes[i]->claimed, memory_order_relaxed);
     if (claimed > most) most = claimed;
   }
   return most;
@@ -80,10 +87,14 @@ PUBLIC int64_t grant_withdraw(Counter *grant, Counter *const *nodes, int64_t n) 
 
 PUBLIC int64_t counter_value(const Counter *counter) { return value_of(counter); }
 
-PUBLIC uint32_t bell_seen(const Place *place) { return atomic_load(&place->bells[place->own].rung); }
+/* Acquire: the reasons to stay awake are looked at after it, and were written before it was rung. */
+PUBLIC uint32_t bell_seen(const Place *place) {
+  return atomic_load_explicit(&place->bells[place->own].rung, memory_order_acquire);
+}
 
 /* ---- one step of one member */
 
+/* Volatile only so that the compiler does not calculate with them: nobody writes them. */
 static volatile const double ONE = 1.0, HALF_ULP = 0x1p-53, QUARTER_ULP = 0x1p-54, TINY = 0x1p-1074;
 
 /* Whether a model has left the mode "round to nearest, subnormal numbers": each other mode changes one of these. */
@@ -383,6 +394,7 @@ PUBLIC int64_t member_step(Member *member, int64_t step) {
 
 /* ---- a node */
 
+/* Release: who sees the stamp of a row sees its values. */
 static inline void stamp(Member *member, int64_t row, int64_t value) {
   const Output *own = &member->outputs[0];
   atomic_store_explicit(stamp_of(own->rows, own->stride, own->mask, row), value, memory_order_release);
@@ -646,7 +658,7 @@ static inline Wish wish_of(const Node *node, const Unit *unit) {
 /* Sleep until a unit may step, Python has something to do, or the time is over. */
 static int64_t await(Node *node, int64_t limit_ns) {
   uint32_t seen = bell_seen(&node->place);
-  if (atomic_load(&node->attention)) return 0;
+  if (atomic_load_explicit(&node->attention, memory_order_seq_cst)) return 0;
   Wish wishes[65]; /* of more units, the others look again when one of these may step, or the time is over */
   int64_t n = 0;
   int by_grant = 0;
@@ -729,11 +741,12 @@ PUBLIC int64_t node_run(Node *node) {
 
 /* From any thread: let the node leave its burst. */
 PUBLIC void node_attend(Node *node) {
-  atomic_store(&node->attention, 1);
+  atomic_store_explicit(&node->attention, 1, memory_order_seq_cst);
   ring_bell(&node->place.bells[node->place.own]);
 }
 
-PUBLIC void node_attended(Node *node) { atomic_store(&node->attention, 0); }
+/* Seq_cst: Python looks for the reasons after it, and who has one stores it before `attention`. */
+PUBLIC void node_attended(Node *node) { atomic_store_explicit(&node->attention, 0, memory_order_seq_cst); }
 
 /* ---- copies: many systems in this process, each with tables of its own. Nobody else reads their memory, so nothing
  * waits: a unit that lacks a row is a fault of its plan. With several threads, each works on a part of the copies; the

@@ -50,14 +50,19 @@ static inline void relax(void) {
 #endif
 }
 
+/* All seq_cst: `needs` was stored before, and a writer that finds `wake_at` lowered has to find it. */
 static inline void lower(_Atomic int64_t *place, int64_t value) {
-  int64_t seen = atomic_load(place);
-  while (value < seen && !atomic_compare_exchange_weak(place, &seen, value)) continue;
+  int64_t seen = atomic_load_explicit(place, memory_order_seq_cst);
+  while (value < seen &&
+         !atomic_compare_exchange_weak_explicit(place, &seen, value, memory_order_seq_cst, memory_order_seq_cst))
+    continue;
 }
 
 /* Of another process, the end of the pipe to write to is opened as its memory was: through /proc. */
 static inline void ring_pipe(const Bell *bell) {
-  const int32_t process = atomic_load(&bell->process), pipe = atomic_load(&bell->pipe);
+  /* relaxed: both were stored before `polls`, which has been read */
+  const int32_t process = atomic_load_explicit(&bell->process, memory_order_relaxed);
+  const int32_t pipe = atomic_load_explicit(&bell->pipe, memory_order_relaxed);
   int fd = pipe;
   if (process != getpid()) {
     char path[64];
@@ -71,39 +76,44 @@ static inline void ring_pipe(const Bell *bell) {
 }
 
 static inline void ring(Bell *bell) {
-  atomic_fetch_add(&bell->rung, 1);
-  if (atomic_load(&bell->polls))
+  /* seq_cst: of this and `poll_streams`, which stores `polls` and then looks at the bell, one sees the other */
+  atomic_fetch_add_explicit(&bell->rung, 1, memory_order_seq_cst);
+  if (atomic_load_explicit(&bell->polls, memory_order_seq_cst))
     ring_pipe(bell);
   else
     syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
 }
 
-/* Wake everybody whose need is met; again if the value has grown meanwhile. */
+/* Wake everybody whose need is met; again if the value has grown meanwhile. All seq_cst, as in `lower`: the scan comes
+ * after NEVER, and finds whoever has lowered `wake_at` before that. */
 static inline void wake(const Place *place, Counter *counter) {
   int64_t lowest;
   do {
-    atomic_store(&counter->wake_at, NEVER);
-    int64_t value = atomic_load(&counter->value);
+    atomic_store_explicit(&counter->wake_at, NEVER, memory_order_seq_cst);
+    int64_t value = atomic_load_explicit(&counter->value, memory_order_seq_cst);
     lowest = NEVER;
     for (int64_t process = 0; process < place->processes; process++) {
-      int64_t need = atomic_load(&counter->needs[process]);
+      int64_t need = atomic_load_explicit(&counter->needs[process], memory_order_seq_cst);
       if (need == 0) continue;
       if (need > value) {
         if (need < lowest) lowest = need;
-      } else if (atomic_compare_exchange_strong(&counter->needs[process], &need, 0)) {
+      } else if (atomic_compare_exchange_strong_explicit(&counter->needs[process], &need, 0, memory_order_seq_cst,
+                                                         memory_order_seq_cst)) {
         ring(&place->bells[process]);
       }
     }
     if (lowest != NEVER) lower(&counter->wake_at, lowest);
-  } while (lowest != NEVER && atomic_load(&counter->value) >= lowest);
+  } while (lowest != NEVER && atomic_load_explicit(&counter->value, memory_order_seq_cst) >= lowest);
 }
 
+/* Relaxed: who must not miss a sleeper has a fence before it. */
 static inline void wake_if_needed(const Place *place, Counter *counter) {
   if (atomic_load_explicit(&counter->wake_at, memory_order_relaxed) <=
       atomic_load_explicit(&counter->value, memory_order_relaxed))
     wake(place, counter);
 }
 
+/* Release, and acquire in `value_of`: who sees the value sees all that was written before it. */
 static inline void raise_counter(const Place *place, Counter *counter, int64_t value) {
   atomic_store_explicit(&counter->value, value, memory_order_release);
   wake_if_needed(place, counter);

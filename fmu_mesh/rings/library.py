@@ -1,7 +1,8 @@
 """Finds the library of C that steps a mesh, and refuses one that was built from other sources.
 
-The library for Linux on x86_64 is beside this module, in a clone and in a wheel. `build_library.py`, at the root of a
-clone, builds it. It contains the SHA-256 of each of its sources, and the sources that are beside it must be these.
+The library for Linux is beside this module: in a clone for each processor, in a wheel for its own. `build_library.py`,
+at the root of a clone, builds it. It contains the SHA-256 of each of its sources, and the sources that are beside it
+must be these.
 """
 
 from __future__ import annotations
@@ -21,13 +22,14 @@ from ..errors import ConfigurationError
 __all__ = ["LIBRARY_VARIABLE", "LibraryFunctions", "library_missed", "load_library", "why_no_library"]
 
 LIBRARY_VARIABLE: Final = "FMU_MESH_LIBRARY"
-"""An environment variable: `none` runs without the library; a path is that of another library."""
+"""An environment variable: `none` runs without the library, `shipped` with that of the package also on a platform where
+it is off by default; a path is that of another library."""
 
 TRIED_ON: Final = ("linux-x86_64",)
 """The platforms whose library is used by default: those on which all tests have run."""
 
-_COULD_BE: Final = ("linux-x86_64", "linux-aarch64")
-"""The platforms that it can be built for, with glibc."""
+_SHIPPED_FOR: Final = ("linux-x86_64", "linux-aarch64")
+"""The platforms whose library is in the package; it needs glibc."""
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
@@ -78,14 +80,17 @@ class LibraryFunctions:
         self.grant_withdraw = PYFUNCTYPE(c_int64, address, address, c_int64)(("grant_withdraw", quick))
 
 
-def load_library() -> str | None:
+def load_library(*, to_step: bool = True) -> str | None:
     """The path of the library for this platform; None if there is none, or if the system refuses to load it.
+
+    It may be off by default because nobody knows whether its rings are right on this processor; who does not ask it
+    ``to_step`` gets it.
 
     Raises:
         ConfigurationError: the library was built from other sources than those beside it, or the environment names one
             that cannot be loaded.
     """
-    return _found()[0]
+    return _found(to_step=to_step)[0]
 
 
 def why_no_library() -> str | None:
@@ -93,7 +98,7 @@ def why_no_library() -> str | None:
 
     It goes on from "the library of C is".
     """
-    why = _found()[1]
+    why = _found(to_step=True)[1]
     if why is None:
         return None
     return (
@@ -104,7 +109,7 @@ def why_no_library() -> str | None:
 
 def library_missed() -> bool:
     """Whether there is no library, although there could be one here, and nobody has chosen to run without it."""
-    could_be = _here() in _COULD_BE and platform.libc_ver()[0] == "glibc"
+    could_be = _here() in _SHIPPED_FOR and platform.libc_ver()[0] == "glibc"
     return could_be and os.environ.get(LIBRARY_VARIABLE) != "none" and load_library() is None
 
 
@@ -112,16 +117,18 @@ def _here() -> str:
     return f"{sys.platform}-{platform.machine()}"
 
 
-def _found() -> tuple[str | None, str | None]:
+def _found(*, to_step: bool) -> tuple[str | None, str | None]:
     chosen = os.environ.get(LIBRARY_VARIABLE)
     if chosen == "none":
         return None, f"the environment variable {LIBRARY_VARIABLE} is none"
-    if chosen:
+    here = _here()
+    if chosen and chosen != "shipped":
         path = Path(chosen).resolve()
+    elif here not in _SHIPPED_FOR:
+        return None, f"it is for {' and '.join(_SHIPPED_FOR)}, and this is {here}"
+    elif not chosen and to_step and here not in TRIED_ON:
+        return None, f"it has not run on real {here}, so it is used only with {LIBRARY_VARIABLE}=shipped"
     else:
-        here = _here()
-        if here not in TRIED_ON:
-            return None, f"it is for {', '.join(TRIED_ON)}, and this is {here}"
         path = Path(__file__).with_name(f"burst-{here}.so")
     try:
         loaded = ctypes.CDLL(str(path))

@@ -25,6 +25,10 @@
  *     `state` is LATE.
  *   - The process ends while the other thread sends: who closes the stream shuts the socket down, and takes the flag.
  *
+ * Memory orders (burst.c has the rules). `state` is stored with release: why is stored before it. Who takes `sending` or
+ * sees that somebody has asked (acquire) sees what the others had before they wrote it (release). `sent` and `flushed_ns`
+ * are relaxed: who has the flag writes them, and others only decide when to look.
+ *
  * Waiting. `poll` does not wait for a futex. So a process with streams, before it polls, says so in its bell, and looks
  * once more at what it waits for; who rings such a bell writes into a pipe (`counters.h`). Rings alone cost no system
  * call more. Considered and given up: an eventfd, which no other process can open, and io_uring, which containers
@@ -60,11 +64,17 @@ static void put_header(Stream *stream, int kind, int64_t link, int64_t count, in
   put(stream, &header, sizeof header);
 }
 
+static inline int64_t rows_sent(const Outgoing *out) { return atomic_load_explicit(&out->sent, memory_order_relaxed); }
+
+static inline int is_open(const Stream *stream) {
+  return atomic_load_explicit(&stream->state, memory_order_acquire) == OPEN;
+}
+
 static int64_t room(const Stream *stream) { return stream->send_size - stream->send_to - (int64_t)sizeof(Header); }
 
 /* Put rows of a ring into the buffer, as many as fit. Returns whether some are left. */
 static int put_rows(Stream *stream, Outgoing *out, int64_t ready) {
-  int64_t next = out->sent;
+  int64_t next = rows_sent(out);
   while (next < ready) {
     int64_t count = room(stream) / out->row_bytes;
     if (count <= 0) return 1;
@@ -80,14 +90,14 @@ static int put_rows(Stream *stream, Outgoing *out, int64_t ready) {
       const int64_t oldest = value_of(out->counter) - out->mask - 1; /* may be overwritten just now */
       if (oldest < next) { /* it is in the ring, and no writer leaves it like this */
         stream->about = out->link;
-        atomic_store(&stream->state, LATE);
+        atomic_store_explicit(&stream->state, LATE, memory_order_release);
         return 0;
       }
       stream->send_to = begin;
       next = oldest > next ? oldest : next + 1;
       break;
     }
-    atomic_store(&out->sent, next);
+    atomic_store_explicit(&out->sent, next, memory_order_relaxed);
   }
   return 0;
 }
@@ -97,20 +107,22 @@ static int fill(Stream *stream, int all) {
   for (int64_t i = 0; i < stream->n_told; i++) { /* before any rows, which may be many: others wait for these numbers */
     Told *told = &stream->told[i];
     const int64_t value = value_of(told->counter);
-    if (value <= told->sent || (told->stride > 0 ? value < told->sent + told->stride : !all)) continue;
+    const int64_t sent = atomic_load_explicit(&told->sent, memory_order_relaxed);
+    if (value <= sent || (told->stride > 0 ? value < sent + told->stride : !all)) continue;
     if (room(stream) < 0) return 1;
     put_header(stream, told->kind, told->number, 0, value);
-    told->sent = value;
+    atomic_store_explicit(&told->sent, value, memory_order_relaxed);
   }
   for (int64_t i = 0; i < stream->n_outgoing; i++) {
     Outgoing *out = &stream->outgoing[i];
-    const int64_t ready = value_of(out->counter);
-    if (ready > out->sent && (!out->lazy || all || ready - out->sent > out->mask / 4) && put_rows(stream, out, ready))
-      return 1;
-    if (out->sent == ready && atomic_load(&out->last) == UNSAID) {
+    /* Acquire, and before the counter: if no more rows come, the counter has all of them. */
+    const int64_t last = atomic_load_explicit(&out->last, memory_order_acquire);
+    const int64_t ready = value_of(out->counter), left = ready - rows_sent(out);
+    if (left > 0 && (!out->lazy || all || left > out->mask / 4) && put_rows(stream, out, ready)) return 1;
+    if (rows_sent(out) == ready && last == UNSAID) {
       if (room(stream) < 0) return 1;
       put_header(stream, LAST, out->link, 0, ready);
-      atomic_store(&out->last, SAID);
+      atomic_store_explicit(&out->last, SAID, memory_order_relaxed);
     }
   }
   return 0;
@@ -120,7 +132,7 @@ static int fill(Stream *stream, int all) {
 static int send_new(Stream *stream, int all) {
   for (;;) {
     const int left = fill(stream, all);
-    while (atomic_load(&stream->state) == OPEN && stream->send_from < stream->send_to) {
+    while (is_open(stream) && stream->send_from < stream->send_to) {
       ssize_t sent = send((int)stream->fd, stream->to_send + stream->send_from,
                           (size_t)(stream->send_to - stream->send_from), MSG_DONTWAIT | MSG_NOSIGNAL);
       if (sent >= 0)
@@ -128,9 +140,9 @@ static int send_new(Stream *stream, int all) {
       else if (errno == EAGAIN || errno == EWOULDBLOCK)
         return 1;
       else if (errno != EINTR)
-        atomic_store(&stream->state, CUT);
+        atomic_store_explicit(&stream->state, CUT, memory_order_release);
     }
-    if (atomic_load(&stream->state) != OPEN) return 0;
+    if (!is_open(stream)) return 0;
     stream->send_from = stream->send_to = 0;
     if (!left) return 0;
   }
@@ -139,23 +151,34 @@ static int send_new(Stream *stream, int all) {
 /* Whether something is not sent yet that nobody has to wait for. */
 static int has_new(const Stream *stream) {
   for (int64_t i = 0; i < stream->n_outgoing; i++)
-    if (value_of(stream->outgoing[i].counter) > stream->outgoing[i].sent || stream->outgoing[i].last == UNSAID) return 1;
+    if (value_of(stream->outgoing[i].counter) > rows_sent(&stream->outgoing[i]) ||
+        atomic_load_explicit(&stream->outgoing[i].last, memory_order_relaxed) == UNSAID)
+      return 1;
   for (int64_t i = 0; i < stream->n_told; i++)
-    if (stream->told[i].stride <= 1 && value_of(stream->told[i].counter) > stream->told[i].sent) return 1;
+    if (stream->told[i].stride <= 1 &&
+        value_of(stream->told[i].counter) > atomic_load_explicit(&stream->told[i].sent, memory_order_relaxed))
+      return 1;
   return 0;
+}
+
+/* Replace what `sending` was; whether it was that. Otherwise, `was` is what it is. */
+static inline int set_flag(Stream *stream, int64_t *was, int64_t value) {
+  return atomic_compare_exchange_strong_explicit(&stream->sending, was, value, memory_order_acq_rel,
+                                                 memory_order_relaxed);
 }
 
 static int take_flag(Stream *stream) {
   int64_t nobody = 0;
-  return atomic_compare_exchange_strong(&stream->sending, &nobody, 1);
+  return set_flag(stream, &nobody, 1);
 }
 
-/* Take the flag, or ask the thread that has it to send once more what is new. */
+/* Take the flag, or ask the thread that has it to send once more what is new. Who finds that somebody has asked writes the
+ * flag again: only then the other thread sees what is new here, too. */
 static int take_flag_or_ask(Stream *stream) {
   for (;;) {
     int64_t seen = 0;
-    if (atomic_compare_exchange_strong(&stream->sending, &seen, 1)) return 1;
-    if (seen == 2 || atomic_compare_exchange_strong(&stream->sending, &seen, 2)) return 0;
+    if (set_flag(stream, &seen, 1)) return 1;
+    if (set_flag(stream, &seen, 2)) return 0;
   }
 }
 
@@ -163,13 +186,13 @@ static void *send_rest(void *argument) {
   Stream *stream = argument;
   int64_t own;
   do {
-    atomic_exchange(&stream->sending, 1); /* sees what was new when somebody asked */
+    atomic_exchange_explicit(&stream->sending, 1, memory_order_acquire); /* sees what was new when somebody asked */
     while (send_new(stream, 1)) {
       struct pollfd one = {(int)stream->fd, POLLOUT, 0};
       poll(&one, 1, 100);
     }
     own = 1; /* without the flag, the stream may be freed: nothing may look at it any more */
-  } while (!atomic_compare_exchange_strong(&stream->sending, &own, 0));
+  } while (!set_flag(stream, &own, 0));
   return NULL;
 }
 
@@ -183,7 +206,8 @@ static void send_on(Stream *stream) {
   pthread_attr_setstacksize(&attributes, 1 << 17);
   sigfillset(&all); /* signals are for the main thread */
   pthread_sigmask(SIG_SETMASK, &all, &before);
-  if (pthread_create(&thread, &attributes, send_rest, stream) != 0) atomic_store(&stream->sending, 0);
+  if (pthread_create(&thread, &attributes, send_rest, stream) != 0)
+    atomic_store_explicit(&stream->sending, 0, memory_order_release);
   pthread_sigmask(SIG_SETMASK, &before, NULL);
   pthread_attr_destroy(&attributes);
 }
@@ -191,16 +215,16 @@ static void send_on(Stream *stream) {
 /* Send what is new, give the flag back, and once more if somebody has asked meanwhile. */
 static void send_and_release(Stream *stream, int all) {
   for (int64_t own = 1;; own = all = 1) {
-    atomic_exchange(&stream->sending, 1);
+    atomic_exchange_explicit(&stream->sending, 1, memory_order_acquire);
     if (send_new(stream, all)) return send_on(stream);
-    if (atomic_compare_exchange_strong(&stream->sending, &own, 0)) return;
+    if (set_flag(stream, &own, 0)) return;
   }
 }
 
 static void write_stream(const Streams *streams, Stream *stream, int all) {
-  if (atomic_load(&stream->state) != OPEN) return;
-  if (!all && now() - stream->flushed_ns > streams->lazy_ns) all = 1;
-  if (all) stream->flushed_ns = now(); /* also if the other thread sends it */
+  if (!is_open(stream)) return;
+  if (!all && now() - atomic_load_explicit(&stream->flushed_ns, memory_order_relaxed) > streams->lazy_ns) all = 1;
+  if (all) atomic_store_explicit(&stream->flushed_ns, now(), memory_order_relaxed); /* also if the other thread sends it */
   if (take_flag_or_ask(stream)) send_and_release(stream, all);
 }
 
@@ -213,7 +237,7 @@ void streams_write(Streams *streams, int64_t all) {
 static void refuse(Stream *stream, int state, int64_t about, int64_t row) {
   stream->about = about;
   stream->about_row = row;
-  atomic_store(&stream->state, state);
+  atomic_store_explicit(&stream->state, state, memory_order_release);
 }
 
 static int is_same(const Incoming *in, const char *row, const char *bytes) {
@@ -298,7 +322,7 @@ static void take_frame(Stream *stream, const Header *header) {
 }
 
 static void take(const Place *place, Stream *stream) {
-  while (atomic_load(&stream->state) == OPEN) {
+  while (is_open(stream)) {
     if (stream->rows_left > 0) {
       take_rows(place, stream);
       if (stream->rows_left > 0) return;
@@ -321,7 +345,7 @@ static void take(const Place *place, Stream *stream) {
 
 static int read_stream(const Place *place, Stream *stream) {
   int any = 0;
-  while (atomic_load(&stream->state) == OPEN) {
+  while (is_open(stream)) {
     if (stream->used == stream->filled) {
       stream->used = stream->filled = 0;
     } else if (stream->used > stream->receive_size / 2 || stream->filled == stream->receive_size) {
@@ -337,7 +361,7 @@ static int read_stream(const Place *place, Stream *stream) {
       take(place, stream);
       if (got < free_bytes) break; /* the next call would say that there is no more */
     } else if (got == 0 || (errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR)) {
-      atomic_store(&stream->state, CUT);
+      atomic_store_explicit(&stream->state, CUT, memory_order_release);
       shutdown((int)stream->fd, SHUT_WR); /* the other end waits for that: now it knows that all has come */
     } else if (errno != EINTR) {
       break;
@@ -370,7 +394,7 @@ static void futex_wait(Bell *bell, uint32_t seen, int64_t limit_ns, int *is_late
 static int needs_python(const Streams *streams) {
   for (int64_t i = 0; i < streams->n_streams; i++) {
     const Stream *stream = &streams->streams[i];
-    if (stream->has_ended || (atomic_load(&stream->state) != OPEN && !stream->is_known)) return 1;
+    if (stream->has_ended || (!is_open(stream) && !stream->is_known)) return 1;
   }
   return 0;
 }
@@ -380,8 +404,8 @@ static int64_t due_ns(const Streams *streams) {
   int64_t due = NEVER;
   for (int64_t i = 0; i < streams->n_streams; i++) {
     const Stream *stream = &streams->streams[i];
-    if (atomic_load(&stream->state) == OPEN && has_new(stream) && stream->flushed_ns + streams->lazy_ns < due)
-      due = stream->flushed_ns + streams->lazy_ns;
+    const int64_t own = atomic_load_explicit(&stream->flushed_ns, memory_order_relaxed) + streams->lazy_ns;
+    if (own < due && is_open(stream) && has_new(stream)) due = own;
   }
   return due;
 }
@@ -392,13 +416,13 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
   const int64_t end = now() + limit_ns;
   struct pollfd *polled = streams->polled;
   for (;;) {
-    atomic_store(&bell->polls, 1);
+    atomic_store_explicit(&bell->polls, 1, memory_order_release); /* after where the pipe is: see `ring_pipe` */
     atomic_thread_fence(memory_order_seq_cst);
-    if (atomic_load(&bell->rung) != seen || granted(wishes, n_wishes)) return;
+    if (atomic_load_explicit(&bell->rung, memory_order_acquire) != seen || granted(wishes, n_wishes)) return;
     int64_t n = 0, until = end;
     polled[n++] = (struct pollfd){(int)streams->bell_pipe, POLLIN, 0};
     for (int64_t i = 0; i < streams->n_streams; i++)
-      if (atomic_load(&streams->streams[i].state) == OPEN)
+      if (is_open(&streams->streams[i]))
         polled[n++] = (struct pollfd){(int)streams->streams[i].fd, POLLIN, 0};
     const int64_t due = due_ns(streams);
     if (due < until) until = due;
@@ -406,7 +430,7 @@ static void poll_streams(Streams *streams, Bell *bell, uint32_t seen, const Wish
     if (left < 0) left = 0;
     const struct timespec limit = {left / 1000000000, left % 1000000000};
     const int ready = ppoll(polled, (nfds_t)n, &limit, NULL);
-    atomic_store(&bell->polls, 0); /* what it reads rings its own bell: this needs no pipe */
+    atomic_store_explicit(&bell->polls, 0, memory_order_relaxed); /* what it reads rings its own bell: this needs no pipe */
     if (ready > 0 && polled[0].revents != 0) {
       char bytes[64];
       while (read((int)streams->bell_pipe, bytes, sizeof bytes) == (ssize_t)sizeof bytes) continue;
@@ -428,14 +452,15 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
     Counter *counter = wishes[i].counter;
     if (counter == NULL) continue;
     int64_t other = atomic_load_explicit(&counter->needs[place->own], memory_order_relaxed);
-    if (other == 0 || other > wishes[i].need) atomic_store(&counter->needs[place->own], wishes[i].need);
+    if (other == 0 || other > wishes[i].need) /* seq_cst: before `wake_at`, see `lower` */
+      atomic_store_explicit(&counter->needs[place->own], wishes[i].need, memory_order_seq_cst);
     lower(&counter->wake_at, wishes[i].need);
   }
   atomic_thread_fence(memory_order_seq_cst);
   int is_granted = granted(wishes, n), is_late = 0;
   if (!is_granted && streams != NULL) {
     poll_streams(streams, bell, seen, wishes, n, limit_ns);
-    atomic_store(&bell->polls, 0);
+    atomic_store_explicit(&bell->polls, 0, memory_order_relaxed);
     is_granted = granted(wishes, n);
   } else if (!is_granted) {
     futex_wait(bell, seen, limit_ns, &is_late);
@@ -447,7 +472,8 @@ int64_t sleep_on(const Place *place, Streams *streams, uint32_t seen, const Wish
     }
   }
   for (int64_t i = 0; i < n; i++)
-    if (wishes[i].counter != NULL) atomic_store(&wishes[i].counter->needs[place->own], 0);
+    if (wishes[i].counter != NULL)
+      atomic_store_explicit(&wishes[i].counter->needs[place->own], 0, memory_order_seq_cst);
   return is_granted;
 }
 
@@ -464,7 +490,7 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
   const int64_t end = now() + limit_ns;
   Wish *wishes = streams->wishes;
   for (;;) {
-    const uint32_t seen = atomic_load(&streams->place.bells[streams->place.own].rung);
+    const uint32_t seen = atomic_load_explicit(&streams->place.bells[streams->place.own].rung, memory_order_acquire);
     streams_read(streams);
     streams_write(streams, 1);
     int64_t n = 0;
@@ -472,24 +498,27 @@ PUBLIC void streams_serve(Streams *streams, int64_t limit_ns) {
     for (int64_t i = 0; i < streams->n_streams; i++) {
       const Stream *stream = &streams->streams[i];
       for (int64_t j = 0; j < stream->n_told; j++)
-        if (stream->told[j].stride > 0) wishes[n++] = (Wish){stream->told[j].counter, stream->told[j].sent + stream->told[j].stride};
+        if (stream->told[j].stride > 0) {
+          const int64_t sent = atomic_load_explicit(&stream->told[j].sent, memory_order_relaxed);
+          wishes[n++] = (Wish){stream->told[j].counter, sent + stream->told[j].stride};
+        }
     }
     const int64_t left = end - now();
-    if (left <= 0 || atomic_exchange(&streams->attention, 0)) return;
+    if (left <= 0 || atomic_exchange_explicit(&streams->attention, 0, memory_order_seq_cst)) return;
     sleep_on(&streams->place, streams, seen, wishes, n, left, NULL);
   }
 }
 
 /* From any thread: tell the other process that this one lives, and all that is new. */
 PUBLIC void stream_beat(Stream *stream) {
-  if (atomic_load(&stream->state) != OPEN || !take_flag_or_ask(stream)) return;
+  if (!is_open(stream) || !take_flag_or_ask(stream)) return;
   if (room(stream) >= 0) put_header(stream, ALIVE, 0, 0, 0);
   send_and_release(stream, 1);
 }
 
 /* Shut the socket down, wait for the thread that may send, and keep the flag: from now on nobody uses the stream. */
 PUBLIC void stream_hold(Stream *stream) {
-  atomic_store(&stream->state, CUT);
+  atomic_store_explicit(&stream->state, CUT, memory_order_release);
   shutdown((int)stream->fd, SHUT_RDWR);
   while (!take_flag(stream)) sched_yield();
 }
@@ -498,16 +527,17 @@ PUBLIC void stream_hold(Stream *stream) {
 PUBLIC void stream_open(Stream *stream, int64_t fd) {
   stream->fd = fd;
   stream->send_from = stream->send_to = stream->used = stream->filled = stream->rows_left = 0;
-  for (int64_t i = 0; i < stream->n_told; i++) stream->told[i].sent = -1;
-  stream->heard_ns = stream->flushed_ns = now();
+  for (int64_t i = 0; i < stream->n_told; i++) atomic_store_explicit(&stream->told[i].sent, -1, memory_order_relaxed);
+  stream->heard_ns = now();
+  atomic_store_explicit(&stream->flushed_ns, stream->heard_ns, memory_order_relaxed);
   stream->is_known = 0;
-  atomic_store(&stream->state, OPEN);
-  atomic_store(&stream->sending, 0);
+  atomic_store_explicit(&stream->state, OPEN, memory_order_release);
+  atomic_store_explicit(&stream->sending, 0, memory_order_release);
 }
 
 /* Who rings the bell while this process polls writes into a pipe, of which this process has this descriptor. */
 PUBLIC void streams_listen(Streams *streams, int64_t process, int64_t pipe) {
   Bell *bell = &streams->place.bells[streams->place.own];
-  atomic_store(&bell->process, (int32_t)process);
-  atomic_store(&bell->pipe, (int32_t)pipe);
+  atomic_store_explicit(&bell->process, (int32_t)process, memory_order_relaxed); /* `polls` comes after both */
+  atomic_store_explicit(&bell->pipe, (int32_t)pipe, memory_order_relaxed);
 }

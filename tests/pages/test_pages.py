@@ -395,11 +395,6 @@ NOT_RUN = [
     ),
     ("docs/installation.md", "python3 -m venv .my-venv", "it downloads 100 MB; .ci/run installs the same wheel"),
     (
-        "docs/installation.md",
-        "make .venv/.installed-library",
-        "it downloads a compiler of 100 MB; tests/unit/test_library.py builds the same library",
-    ),
-    (
         "docs/onnx.md",
         "import torch",
         "PyTorch is no requirement here; tests/unit/test_onnx.py reads models of this form",

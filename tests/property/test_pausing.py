@@ -43,7 +43,7 @@ def node(number: int, bursts: tuple[int, ...], without: str) -> Steps[None]:
 
 def master(without: str) -> Steps[None]:
     """`grant_withdraw`, and the grant of the point that it returns."""
-    yield store(GRANT, 0)
+    yield store(GRANT, 0, Order.RELAXED)
     if without != "the fence of grant_withdraw":
         yield FENCE
     most = 0

@@ -180,3 +180,58 @@ def test_fmu_of_no_kind_that_runs_is_told_what_it_is(
     assert main([command, str(file)]) == 2
 
     assert says.rstrip(".") in capsys.readouterr().err
+
+
+def elf(machine: int) -> bytes:
+    """The first bytes of a library for a processor, as ELF calls it."""
+    return b"\x7fELF\x02\x01".ljust(18, b"\0") + machine.to_bytes(2, "little")
+
+
+def with_libraries(target: Path, **libraries: int) -> Path:
+    """An FMU with these folders of libraries, each for a processor, and no sources."""
+    add: dict[str | zipfile.ZipInfo, bytes] = {
+        f"binaries/{name.replace('_', '-')}/Gain.so": elf(machine) for name, machine in libraries.items()
+    }
+    return repacked(target, source=GAIN, keep=lambda name: not name.startswith(("binaries/", "sources/")), add=add)
+
+
+@pytest.fixture
+def on_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fmpy.platform_tuple", "aarch64-linux")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+
+
+@pytest.mark.usefixtures("on_arm")
+@pytest.mark.parametrize(
+    ("libraries", "folder"),
+    [
+        ({"aarch64_linux": 183, "linux64": 62}, "aarch64-linux"),
+        ({"aarch64_linux_gnu": 183, "linux64": 62}, "aarch64-linux-gnu"),  # OpenModelica, for another processor
+        ({"linux64": 183}, "linux64"),  # OpenModelica on ARM itself
+    ],
+)
+def test_on_arm_a_library_is_found_by_each_name_of_its_folder(
+    libraries: dict[str, int], folder: str, tmp_path: Path
+) -> None:
+    description = read_description(with_libraries(tmp_path / "gain.fmu", **libraries))
+
+    assert description.library == f"binaries/{folder}/Gain.so"
+    assert description.problems == ()
+
+
+def test_a_library_for_another_processor_does_not_run_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for_arm = with_libraries(tmp_path / "arm.fmu", linux64=183, aarch64_linux=183)
+    for_x86 = with_libraries(tmp_path / "x86.fmu", linux64=62)
+
+    with pytest.raises(LoadFailed, match=r"platform \(linux64\); it has: aarch64-linux, linux64 \(for aarch64\)\."):
+        read_description(for_arm)
+    monkeypatch.setattr("fmpy.platform_tuple", "aarch64-linux")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    with pytest.raises(LoadFailed, match=r"platform \(aarch64-linux\); it has: linux64 \(for x86_64\)\."):
+        read_description(for_x86)
+
+
+def test_inspect_shows_that_an_fmu_has_a_library_for_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(with_libraries(tmp_path / "gain.fmu", aarch64_linux=183, linux64=62))]) == 0
+
+    assert "Platforms linux64, aarch64-linux Runs here yes" in " ".join(capsys.readouterr().out.split())

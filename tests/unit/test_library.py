@@ -64,22 +64,15 @@ def built_by_the_pinned_compiler() -> bool:
 needs_the_compiler = pytest.mark.skipif(not built_by_the_pinned_compiler(), reason="`make library` installs ziglang")
 
 
-def test_the_library_in_the_tree_was_built_from_the_sources_in_tree() -> None:
-    assert build_library.manifest().encode() in LIBRARY.read_bytes(), "make library"
+@pytest.mark.parametrize("platform", build_library.TARGETS)
+def test_the_library_in_the_tree_was_built_from_the_sources_in_tree(platform: str) -> None:
+    assert build_library.manifest().encode() in build_library.library_path(platform).read_bytes(), "make library"
 
 
 @needs_the_compiler
-def test_whoever_builds_the_library_gets_the_bytes_in_the_tree() -> None:
-    assert build_library.build("linux-x86_64") == LIBRARY.read_bytes(), "make library"
-
-
-@needs_the_compiler
-def test_the_library_for_another_processor_can_be_built_here() -> None:
-    built = build_library.build("linux-aarch64")
-
-    assert built[:4] == b"\x7fELF"
-    assert int.from_bytes(built[18:20], "little") == 183  # AArch64 in the header of ELF
-    assert build_library.manifest().encode() in built
+@pytest.mark.parametrize("platform", build_library.TARGETS)
+def test_whoever_builds_the_library_gets_the_bytes_in_the_tree(platform: str) -> None:
+    assert build_library.build(platform) == build_library.library_path(platform).read_bytes(), "make library"
 
 
 @needs_the_compiler
@@ -113,6 +106,16 @@ def test_a_source_that_the_compiler_refuses_is_told_with_its_message(
         build_library.build("linux-x86_64")
 
 
+def test_each_access_of_an_atomic_names_its_memory_order() -> None:
+    sources = {name: (build_library.PACKAGE / name).read_text() for name in build_library.SOURCES}
+    without = [
+        found for text in sources.values() for found in re.findall(r"\batomic_\w+(?<!_explicit)(?<!_fence)\(", text)
+    ]
+
+    assert without == []
+    assert "-Watomic-implicit-seq-cst" in build_library.FLAGS
+
+
 def test_another_version_of_the_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda _: "0.1.0")
 
@@ -120,10 +123,12 @@ def test_another_version_of_the_compiler_is_refused(monkeypatch: pytest.MonkeyPa
         build_library.build("linux-x86_64")
 
 
-def test_the_library_needs_nothing_but_a_c_library_of_2014_or_later() -> None:
-    content = LIBRARY.read_bytes()
+@pytest.mark.parametrize(("platform", "machine"), [("linux-x86_64", 62), ("linux-aarch64", 183)])
+def test_the_library_needs_nothing_but_a_c_library_of_2014_or_later(platform: str, machine: int) -> None:
+    content = build_library.library_path(platform).read_bytes()
     versions = {tuple(map(int, version.split(b"."))) for version in re.findall(rb"GLIBC_([\d.]+)\0", content)}
 
+    assert int.from_bytes(content[18:20], "little") == machine  # of ELF
     assert max(versions) <= (2, 17)
     assert set(re.findall(rb"\0([\w.-]+\.so[\w.]*)\0", content)) <= {b"libc.so.6", b"libm.so.6", b"libpthread.so.0"}
 
@@ -150,12 +155,36 @@ def test_on_platform_never_tried_library_is_used_only_if_it_is_named(
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
 
     assert load_library() is None
-    assert why_no_library() == f"not used: it is for linux-x86_64, and this is linux-aarch64. {COST}"
+    assert why_no_library() == (
+        f"not used: it has not run on real linux-aarch64, so it is used only with FMU_MESH_LIBRARY=shipped. {COST}"
+    )
     assert library_missed()
     monkeypatch.setenv(LIBRARY_VARIABLE, str(named))
     assert load_library() == str(named)
     assert why_no_library() is None
     assert not library_missed()
+
+
+def test_the_shipped_library_is_used_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fmu_mesh.rings.library.TRIED_ON", ())
+    without = load_library()
+    for_messages = load_library(to_step=False)  # has nothing to do with the rings
+
+    monkeypatch.setenv(LIBRARY_VARIABLE, "shipped")
+
+    assert (without, for_messages) == (None, str(LIBRARY))
+    assert load_library() == str(LIBRARY)
+    assert not library_missed()
+
+
+def test_a_processor_that_no_library_is_for_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "riscv64")
+    monkeypatch.setenv(LIBRARY_VARIABLE, "shipped")
+
+    assert load_library(to_step=False) is None
+    assert (why_no_library() or "").startswith(
+        "not used: it is for linux-x86_64 and linux-aarch64, and this is linux-riscv64."
+    )
 
 
 @pytest.mark.parametrize(("machine", "libc"), [("riscv64", "glibc"), ("x86_64", "")])
@@ -238,14 +267,21 @@ def test_where_the_library_cannot_be_loaded_a_sentence_says_why(clone: Path, con
     ), asked
 
 
-def test_a_wheel_for_linux_has_the_library_of_the_tree(tmp_path: Path) -> None:
+@pytest.mark.parametrize("processor", ["x86_64", "aarch64"])
+def test_a_wheel_for_linux_has_the_library_of_the_tree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processor: str
+) -> None:
+    monkeypatch.setenv("_PYTHON_HOST_PLATFORM", f"linux-{processor}")  # of Python's own build; tools keep to it
+
     wheel = next(WheelBuilder(str(build_library.ROOT)).build(directory=str(tmp_path), versions=["standard"]))
 
-    assert wheel.endswith("-py3-none-manylinux_2_17_x86_64.whl")
+    library = build_library.library_path(f"linux-{processor}")
+    name = library.relative_to(build_library.ROOT).as_posix()
+    assert wheel.endswith(f"-py3-none-manylinux_2_17_{processor}.whl")
     with zipfile.ZipFile(wheel) as archive:
-        assert archive.read(NAME) == LIBRARY.read_bytes()
+        assert archive.read(name) == library.read_bytes()
         assert "fmu_mesh/rings/burst.h" in archive.namelist()
-        assert [name for name in archive.namelist() if name.endswith(".so")] == [NAME]
+        assert [name for name in archive.namelist() if name.endswith(".so")] == [name]
 
 
 def test_a_wheel_that_is_built_on_another_system_has_no_library(

@@ -1,10 +1,10 @@
 """Callbacks for FMUs, and the assignment of log messages to instances.
 
 The loggers are those of `messages.c`, which format messages and pass on a limited number; without the library of C,
-FMPy's proxy formats them, and all are passed on. A message goes to the instance whose address comes with it: the
-environment that the instance was made with (FMI 2.0, 2.1.5; FMI 3.0, 2.3.1), or the component (FMI 1.0, 2.3). Some FMUs
-pass neither; then the instance name decides, which instances of several meshes in one process may share. If this name
-is unknown as well, every instance gets the message, because it may be the reason why a call fails.
+FMPy's proxy formats them where it has one, and all are passed on. A message goes to the instance whose address comes
+with it: the environment that the instance was made with (FMI 2.0, 2.1.5; FMI 3.0, 2.3.1), or the component (FMI 1.0,
+2.3). Some FMUs pass neither; then the instance name decides, which instances of several meshes in one process may
+share. If this name is unknown as well, every instance gets the message, because it may be the reason why a call fails.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def _fmi1_callbacks() -> fmi1.fmi1CallbackFunctions:
 
 
 _PASS_ON: Final = ctypes.CFUNCTYPE(None, ctypes.POINTER(_Message))(_pass_on)
-_library: Final = ctypes.PyDLL(path) if (path := load_library()) is not None else None
+_library: Final = ctypes.PyDLL(path) if (path := load_library(to_step=False)) is not None else None
 if _library is not None:
     _library.pass_messages_to(_PASS_ON)
 _FMI2_CALLBACKS = _fmi2_callbacks()

@@ -147,7 +147,7 @@ class LoadedFmu:
 
     def _load(self) -> Any:  # noqa: ANN401 FMPy is untyped
         functions, description = self._fmu.functions, self._fmu.description
-        path = self._folder / library_name(description.model_identifier, description.fmi_version)
+        path = self._folder / library_name(description.model_identifier, description.fmi_version, [description.library])
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
             library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
             return calling(functions.library)(
@@ -156,6 +156,7 @@ class LoadedFmu:
                 guid=description.guid,
                 modelIdentifier=description.model_identifier,
                 unzipDirectory=str(self._folder),
+                libraryPath=str(path),
                 instanceName=self._fmu.name,
             )
 

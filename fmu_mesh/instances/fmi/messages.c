@@ -41,10 +41,10 @@ static atomic_flag locked = ATOMIC_FLAG_INIT;
 static void (*pass_on)(const Message *);
 
 static void lock(void) {
-  while (atomic_flag_test_and_set(&locked)) sched_yield();
+  while (atomic_flag_test_and_set_explicit(&locked, memory_order_acquire)) sched_yield();
 }
 
-static void unlock(void) { atomic_flag_clear(&locked); }
+static void unlock(void) { atomic_flag_clear_explicit(&locked, memory_order_release); }
 
 static void copy(Message *to, const Message *from) {
   memcpy(to, from, offsetof(Message, text) + strlen(from->text) + 1);

@@ -78,6 +78,10 @@ class OpenFmu(ABC):
         """The content of one of its libraries, of any size that the limits of an archive allow."""
 
     @abstractmethod
+    def read_begin(self, name: str, size: int) -> bytes:
+        """The first ``size`` bytes of one of its files."""
+
+    @abstractmethod
     def content_sha256(self) -> str:
         """Calculate the SHA-256 of the archive, or of the names and contents of all files of a folder."""
 
@@ -209,6 +213,10 @@ class _Archive(OpenFmu):
         with reading(self.path):
             return self._zip.read(self._entries[self._known(name)])
 
+    def read_begin(self, name: str, size: int) -> bytes:
+        with reading(self.path), self._zip.open(self._entries[self._known(name)]) as file:
+            return file.read(size)
+
     def content_sha256(self) -> str:
         with reading(self.path):
             return self._sha256()
@@ -255,6 +263,10 @@ class _Folder(OpenFmu):
     def read_binary(self, name: str) -> bytes:
         with reading(self.path):
             return (self.path / self._known(name)).read_bytes()
+
+    def read_begin(self, name: str, size: int) -> bytes:
+        with reading(self.path), (self.path / self._known(name)).open("rb") as file:
+            return file.read(size)
 
     def content_sha256(self) -> str:
         with reading(self.path):

@@ -7,6 +7,7 @@ entities, and `repair`.
 
 from __future__ import annotations
 
+import platform
 import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
@@ -20,10 +21,14 @@ from ....errors import LoadFailed
 from .archive import Contents, OpenFmu
 from .repairing import repair
 
-__all__ = ["examine", "find_library", "library_name", "source_names"]
+__all__ = ["examine", "find_library", "library_folders", "library_name", "names_here", "source_names"]
 
 _SHOWN: Final = 3
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
+
+_ARM: Final = "aarch64-linux"
+_PROCESSORS: Final = {62: "x86_64", 183: "aarch64"}
+"""What ELF calls them."""
 
 
 def examine(fmu: OpenFmu) -> tuple[Contents, Any, tuple[str, ...]]:
@@ -73,10 +78,38 @@ def _what_it_is(path: Path, names: Collection[str]) -> str:
     return "An FMU that was zipped inside a folder of its own must be zipped again without that folder."
 
 
-def library_name(identifier: str, fmi_version: str) -> str:
-    """The path of the library for this platform inside an FMU (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1)."""
-    platform = fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform
-    return f"binaries/{platform}/{identifier}{_SUFFIX}"
+def library_folders(fmi_version: str) -> tuple[str, ...]:
+    """What FMUs call this platform, the name of the standard first (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1).
+
+    For ARM, FMI 2.0 takes the name of FMI 3.0. OpenModelica writes that of Debian, or on ARM itself `linux64`.
+    """
+    if fmpy.platform_tuple == _ARM and not fmi_version.startswith("3"):
+        return _ARM, f"{_ARM}-gnu", "linux64"
+    return (fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform,)
+
+
+def library_name(identifier: str, fmi_version: str, names: Iterable[str | None] = ()) -> str:
+    """The path of the library for this platform inside an FMU, in the first folder for it that ``names`` has."""
+    there = {name.rpartition("/")[0] for name in names if name is not None}
+    folders = [f"binaries/{folder}" for folder in library_folders(fmi_version)]
+    return f"{next((folder for folder in folders if folder in there), folders[0])}/{identifier}{_SUFFIX}"
+
+
+def names_here(fmu: OpenFmu, names: Iterable[str], fmi_version: str) -> frozenset[str]:
+    """The names of the files of an FMU, with each library for another processor in a folder that says so.
+
+    For `linux64` only says that it has 64 bits, and FMUs that were exported on ARM have it, too.
+    """
+    own, found = "|".join(library_folders(fmi_version)), set[str]()
+    for name in names:
+        if (library := re.fullmatch(rf"(binaries/(?:{own}))(/[^/]*{_SUFFIX})", name)) is not None:
+            begin = fmu.read_begin(name, 20)
+            processor = _PROCESSORS.get(int.from_bytes(begin[18:], "little")) if begin.startswith(b"\x7fELF") else None
+            if processor not in {None, platform.machine()}:
+                found.add(f"{library[1]} (for {processor}){library[2]}")
+                continue
+        found.add(name)
+    return frozenset(found)
 
 
 def source_names(names: Iterable[str]) -> list[str]:
@@ -93,12 +126,12 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     identifier, *others_of_it = identifiers
     if "/" in identifier or "\\" in identifier or identifier.startswith("."):
         raise LoadFailed(f"'{path}' has the model identifier '{identifier}', which cannot be the name of a library.")
-    wanted = library_name(identifier, fmi_version)
+    wanted = library_name(identifier, fmi_version, names)
     if identifier and wanted in names:
         return wanted
     folder = wanted.rpartition("/")[0]
     there = sorted(name for name in names if name.rpartition("/")[0] == folder and name.endswith(_SUFFIX))
-    known = [name for one in others_of_it if (name := library_name(one, fmi_version)) in there]
+    known = [name for one in others_of_it if (name := library_name(one, fmi_version, names)) in there]
     others = [name for name in there if name not in known]
     if len(others) == 1:
         return others[0]

@@ -23,7 +23,7 @@ from ....variables.model_description import Causality, Clock, DefaultExperiment,
 from ..step_options import Terms
 from .archive import Contents, OpenFmu, opened
 from .declared_variables import number, states_of, variables_of
-from .examining import examine, find_library, library_name
+from .examining import examine, find_library, library_name, names_here
 
 __all__ = ["description_of", "parsed", "read_description"]
 
@@ -58,10 +58,13 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
             f"the modelDescription.xml of '{path}' has no ModelStructure, which has its continuous states."
         )
     platforms = tuple(fmpy.supported_platforms(_readable(contents)))
+    if any(name.startswith("binaries/aarch64-linux") for name in contents.names):
+        platforms += ("aarch64-linux",)  # FMPy does not know it
     interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
     identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
-    library = find_library(path, contents.names, identifiers, version) if to_run else None
-    if library is not None and library != (wanted := library_name(identifiers[0], version)):
+    names = names_here(fmu, contents.names, version) if to_run else frozenset()
+    library = find_library(path, names, identifiers, version) if to_run else None
+    if library is not None and library != (wanted := library_name(identifiers[0], version, names)):
         what = (
             f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"
         )

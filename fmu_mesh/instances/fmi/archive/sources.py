@@ -33,7 +33,7 @@ from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from ..step_options import Terms
 from .archive import OpenFmu, in_new_folder, opened
-from .examining import examine, library_name, source_names
+from .examining import examine, library_folders, library_name, source_names
 from .library_names import rename_libraries
 from .reading import description_of, parsed
 
@@ -48,6 +48,7 @@ _SHOWN_LINES: Final = 12
 _HEADER_SUFFIXES: Final = (".h", ".hh", ".hpp", ".hxx", ".inc")
 _MAKES: Final = b"fmi2Instantiate"
 _SUFFIX = str(fmpy.sharedLibraryExtension)
+_PLATFORM: Final = library_folders("2.0")[0]
 _HEADERS = Path(fmpy.__file__).parent / "c-code"
 _OWN_HEADERS = Path(__file__).parent / "headers"
 """The headers of FMI 1.0."""
@@ -175,7 +176,7 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
     """Unpack an FMU into an empty folder, and give it the library that it lacks."""
     fmu.unpack_into(folder)
     if model is None:
-        platforms = (fmpy.platform, fmpy.platform_tuple)
+        platforms = (*library_folders("2.0"), *library_folders("3.0"))
         is_complete = any(any(folder.glob(f"binaries/{name}/*{_SUFFIX}")) for name in platforms)
     else:
         is_complete = model.library is not None
@@ -183,7 +184,7 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
         _add_library(fmu, folder, model, tell)
     elif model is not None:
         # A link with the name that FMI requires; other libraries of the FMU may refer to the original name.
-        named = folder / library_name(model.model_identifier, model.fmi_version)
+        named = folder / library_name(model.model_identifier, model.fmi_version, [model.library])
         if not named.exists():
             named.symlink_to(PurePosixPath(model.library or "").name)
 
@@ -266,7 +267,7 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     own, target = _command(path, sources, build)
     if target.is_file():
         return target
-    tell(f"'{path}' has no binary for this platform ({fmpy.platform}): compiling its sources into '{target.parent}'")
+    tell(f"'{path}' has no binary for this platform ({_PLATFORM}): compiling its sources into '{target.parent}'")
     try:
         target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:

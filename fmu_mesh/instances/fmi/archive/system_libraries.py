@@ -21,8 +21,11 @@ from .shared_library import SharedLibrary, libraries_beside, read_shared_library
 __all__ = ["missing_libraries"]
 
 _CACHE: Final = Path("/etc/ld.so.cache")
-_FOLDERS: Final = ("/lib64", "/usr/lib64", "/lib", "/usr/lib", f"{sys.base_prefix}/lib")
-"""The usual ones, and that of Python: its libraries are loaded already."""
+_FOLDERS: Final = (
+    *("/lib64", "/usr/lib64", "/lib", "/usr/lib", f"/lib/{os.uname().machine}-linux-gnu"),
+    f"{sys.base_prefix}/lib",
+)
+"""The usual ones, that of Debian, and that of Python: its libraries are loaded already."""
 
 _PACKAGES: Final = {"libz.so.1": "zlib1g", "libGLU.so.1": "libglu1-mesa", "libxml2.so.2": "libxml2"}
 _BY_RULE: Final = re.compile(

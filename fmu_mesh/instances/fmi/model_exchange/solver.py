@@ -366,7 +366,13 @@ def _view(address: int, count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
 @cache
 def _sundials() -> Any:  # noqa: ANN401 ctypes has no types
     """The functions of SUNDIALS that `CVodeSolver` calls, from the libraries that FMPy ships."""
-    from fmpy.sundials import libraries  # noqa: PLC0415 the import loads the libraries: only if needed
+    try:
+        from fmpy.sundials import libraries  # noqa: PLC0415 the import loads the libraries: only if needed
+    except OSError as error:
+        raise SolverFailed(
+            f"cvode is not there: FMPy ships no SUNDIALS for this platform ({error}); `solver: {{name: dopri5}}` needs "
+            "the library of C, `euler` nothing"
+        ) from error
 
     pointer, real, integer, size = ctypes.c_void_p, ctypes.c_double, ctypes.c_int, ctypes.c_int64
     types: dict[Any, dict[str, tuple[Any, ...]]] = {  # of the result, and of each argument
