@@ -179,7 +179,9 @@ class ProcessConfig(Base, frozen=True, kw_only=True):
     @property
     def of_node(self) -> ProcessConfig:
         """What is for the process of the node: a sandbox of WebAssembly, and its memory, are within it."""
-        return replace(self, memory=None, sandbox=None) if self.sandbox == "wasm" else self
+        if self.sandbox == "bubblewrap":
+            return self
+        return replace(self, sandbox=None, memory=None if self.sandbox == "wasm" else self.memory)
 
     def over(self, general: ProcessConfig) -> ProcessConfig:
         """This section, with what a more general one says where this one says nothing."""

@@ -31,7 +31,7 @@ WASMTIME: Final = "50."
 """The major version of wasmtime whose structures `host.c` has."""
 
 _USERS: Final = "FMUs in a sandbox of WebAssembly"
-_TARGET: Final = ("-target", "wasm32-wasi", "-O2", "-g0", "-ffp-contract=off")
+_TARGET: Final = ("-target", "wasm32-wasi", "-O2", "-g0", "-ffp-contract=off", "-fvisibility=default")
 _REACTOR: Final = ("-mexec-model=reactor", "-rdynamic", "-Wl,--export=__stack_pointer", "-Wl,-z,stack-size=1048576")
 _HOST_FLAGS: Final = ("-std=gnu23", "-O2", "-g0", "-fPIC", "-shared", "-fvisibility=hidden")
 

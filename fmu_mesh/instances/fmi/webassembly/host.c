@@ -379,7 +379,7 @@ static Trap *out_of_memory_from(void *unused, void *caller, Raw *arguments, size
 
     (void)unused, (void)n;
     snprintf(g->why, sizeof g->why,
-             "it asked for %.1f MiB more than the %.0f MiB that it may have: raise `process: {memory: ...}` (4 GiB at most)",
+             "it asked for %.1f MiB more than the %.0f MiB that it may have: raise `process.memory` (4 GiB at most)",
              (uint32_t)arguments[0].i / 1048576.0, (double)memory_limit / 1048576.0);
     return wasmtime_trap_new("memory", 6);
 }
