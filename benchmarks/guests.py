@@ -1,7 +1,7 @@
 """`python -m benchmarks.guests`: what a sandbox of WebAssembly costs: the example FMUs, natively and as guests.
 
-Each is the only copy of a batch, whose steps C takes, in interleaved rounds, and the fastest round counts. Models that are a few operations
-show the time of the calls.
+Each is the only copy of a batch, whose steps C takes, in interleaved rounds, and the fastest round counts. Models that
+are a few operations show the time of the calls. Short rounds (`--points 2000 --rounds 150`) are for a busy machine.
 """
 
 from __future__ import annotations

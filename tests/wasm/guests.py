@@ -66,5 +66,6 @@ def rogue(folder: Path) -> Path:
 def meshed(fmu: Path | str, process: dict[str, Any] | None = SANDBOX, **keys: Any) -> fmu_mesh.Mesh:  # noqa: ANN401 those of an instance
     """A mesh of one instance, with steps of 0.1 s for 1 s."""
     mesh = fmu_mesh.Mesh("guest", step_size=0.1, stop_time=1.0)
-    mesh.add("one", fmu=str(fmu), **keys, **({"process": process} if process else {}))
+    own: dict[str, Any] = keys | ({"process": process} if process else {})
+    mesh.add("one", fmu=str(fmu), **own)
     return mesh

@@ -51,8 +51,8 @@ def test_a_fault_in_a_node_ends_the_run_with_names(place: Place, fault: str) -> 
         place.folder,
         instances={"one": {"fmu": str(rogue(place.folder)), "start_values": {"k": NUMBERS[fault]}}},
         connections=[],
-        process=SANDBOX,
-        timeouts={"step": 2.0},
+        process=SANDBOX | {"memory": "32 MiB"},
+        timeouts={"step": 5.0},
     )
 
     launched = place.run("launch", config)
@@ -60,7 +60,10 @@ def test_a_fault_in_a_node_ends_the_run_with_names(place: Place, fault: str) -> 
     assert launched.wait() != 0
     assert "one" in launched.message
     assert "point 500" in launched.message or "point 499" in launched.message, launched.story()
-    words = WORDS | {"endless": "it did not return within 2 s (`timeouts.step`)", "memory": "1024 MiB that it may have: raise `process.memory`"}
+    words = WORDS | {
+        "endless": "it did not return within 5 s (`timeouts.step`)",
+        "memory": "32 MiB that it may have: raise `process.memory`",
+    }
     assert words[fault] in launched.message, launched.story()
     place.assert_nothing_left()
 

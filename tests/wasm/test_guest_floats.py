@@ -94,7 +94,7 @@ def test_nodes_give_the_floats_of_one_process(place: Place) -> None:
 
 
 def test_a_group_may_have_guests_and_others(place: Place) -> None:
-    instances = {
+    instances: dict[str, dict[str, Any]] = {
         "gain": {"fmu": "Gain", "start_values": {"k": 3.0, "u": 2.0}, "group": "one", "process": SANDBOX},
         "integrator": {"fmu": "Integrator", "group": "one"},
     }

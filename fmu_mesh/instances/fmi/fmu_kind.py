@@ -219,7 +219,7 @@ class FmuKind(Kind[FmuConfig]):
     ) -> ModelDescription:
         """Read the model description; compile the FMU if it has no binary for this platform.
 
-        What runs in a sandbox of bubblewrap is compiled there: a source can include any file that the compiler can read.
+        What runs in a sandbox of bubblewrap is compiled there: a source can include any file that a compiler can read.
         """
         from .archive.reading import read_description  # noqa: PLC0415  FMPy is slow to import
         from .archive.sources import describe  # noqa: PLC0415  as above

@@ -25,8 +25,8 @@ __all__ = ["examine", "find_library", "library_name", "source_names"]
 _SHOWN: Final = 3
 _EXPORT: Final = "Export it for this platform, or with its sources."
 _COMPONENT: Final = (
-    "Its binary for WebAssembly is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with its "
-    "sources, which `process: {sandbox: wasm}` compiles for WebAssembly."
+    "Its binary for WebAssembly is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with "
+    "its sources, which `process: {sandbox: wasm}` compiles for WebAssembly."
 )
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
 

@@ -158,29 +158,24 @@ def describe(
 ) -> ModelDescription:
     """Read the model description of an FMU and get it ready to run, while its archive is open once.
 
-    If it is to run in a sandbox of WebAssembly with so many bytes of ``guest_memory``, or has no library for this platform, its sources are compiled into the cache; ``tell`` is called before that.
+    If it has no library for this platform, or is to run in a sandbox of WebAssembly with so many bytes of
+    ``guest_memory``, its sources are compiled into the cache; ``tell`` is called before that.
     Its SHA-256 is known afterwards, so that `content_of` does not read it again. If its sources do not compile,
     `LoadFailed` has the first lines of the compiler.
     """
     with opened(path, terms) as fmu:
         fmu.content_sha256()
-        model = description_of(fmu, kind)
-        if guest_memory is not None:
-            model = compiling.as_guest(path, model, guest_memory)
+        model = _model_of(fmu, kind, guest_memory)
         if model.library is None:
             with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, reading(path):
                 _fill(fmu, tell, model, Path(folder))
     return model
 
 
-def needs_compiler(
-    path: Path, terms: Terms, kind: Literal["auto"] | Kind, guest_memory: int | None = None
-) -> bool:
+def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind, guest_memory: int | None = None) -> bool:
     """Whether `describe` would compile what nobody has compiled before; nothing is."""
     with opened(path, terms) as fmu:
-        model = description_of(fmu, kind)
-        if guest_memory is not None:
-            model = compiling.as_guest(path, model, guest_memory)
+        model = _model_of(fmu, kind, guest_memory)
         if model.library is not None:
             return False
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as name, reading(path):
@@ -188,6 +183,11 @@ def needs_compiler(
             fmu.unpack_into(folder)
             build = _build_of(fmu, folder, model)
             return build is not None and not _command(path, folder / "sources", build)[1].is_file()
+
+
+def _model_of(fmu: OpenFmu, kind: Literal["auto"] | Kind, guest_memory: int | None) -> ModelDescription:
+    model = description_of(fmu, kind)
+    return model if guest_memory is None else compiling.as_guest(fmu.path, model, guest_memory)
 
 
 def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | None, folder: Path) -> None:
@@ -272,7 +272,9 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         (language,) = languages
         if re.fullmatch(r"C(\+\+)?\d\d", language):
             options.append(f"-std={language.lower().replace('c', 'gnu', 1)}")
-    return _Build(str(description.fmiVersion), identifier, tuple(sources), tuple(includes), tuple(options), is_guest=False)
+    return _Build(
+        str(description.fmiVersion), identifier, tuple(sources), tuple(includes), tuple(options), is_guest=False
+    )
 
 
 def _inside(path: Path, name: str) -> str:

@@ -16,11 +16,11 @@ from msgspec.structs import replace
 
 from .... import files
 from ....errors import LoadFailed
-from ....installing import importing, library_missing
+from ....installing import require
 from ....variables.model_description import ModelDescription
 
 if TYPE_CHECKING:
-    from types import ModuleType
+    import wasmtime
 
 __all__ = ["FOLDER", "as_guest", "compiler", "environment", "make_library"]
 
@@ -55,11 +55,9 @@ def compiler(*, plus: bool) -> list[str]:
         LibraryMissing: ziglang or wasmtime is not installed.
         LoadFailed: wasmtime has another version.
     """
-    for library in ("ziglang", "wasmtime"):
-        try:
-            version = metadata.version(library)
-        except metadata.PackageNotFoundError as error:
-            raise library_missing(library, _USERS) from error
+    require("ziglang", _USERS)
+    require("wasmtime", _USERS)
+    version = metadata.version("wasmtime")
     if not version.startswith(WASMTIME):
         raise LoadFailed(
             f"wasmtime {version} is installed, and the sandbox is written for {WASMTIME}x.",
@@ -78,46 +76,50 @@ def environment() -> dict[str, str]:
 def make_library(
     fmi_version: str, identifier: str, command: Sequence[str], draft: Path, run: Callable[[Sequence[str]], None]
 ) -> None:
-    """Make the library ``draft``; ``command`` compiles the sources, and ``run`` runs a command in the folder of the draft.
+    """Make the library ``draft``; ``command`` compiles the sources, and ``run`` runs a command in its folder.
 
     Raises:
         LoadFailed: the compiler or wasmtime refuses something.
     """
-    with importing("wasmtime", _USERS):
-        import wasmtime  # noqa: PLC0415  an optional library
     folder, cc = draft.parent, [sys.executable, "-m", "ziglang", "cc"]
     options = [f"-DFMI={fmi_version[0]}"]
     shim, module = folder / "guest.o", folder / "guest.wasm"
     run([*cc, *_TARGET, *options, f"-DPREFIX={identifier}", "-c", str(FOLDER / "guest.c"), "-o", str(shim)])
     run([*command, str(shim), *_REACTOR, "-o", str(module)])
-    compiled = _compiled(wasmtime, module.read_bytes())
+    compiled = _compiled(module.read_bytes())
     (folder / "module.bin").write_bytes(compiled.serialize())
     names = [export.name for export in compiled.exports if "fmi" in export.name]
     prefix = next((name.partition("fmi")[0] for name in names if name.endswith("fmi2Instantiate")), "")
     own = [name.removeprefix(prefix) for name in names]
-    states = [f"{verb}FMU{'s' if fmi_version[0] == '2' else 'S'}tate*" for verb in ("*Get", "*Set", "*Free", "*erialize")]
+    states = [
+        f"{verb}FMU{'s' if fmi_version[0] == '2' else 'S'}tate*" for verb in ("*Get", "*Set", "*Free", "*erialize")
+    ]
     visible = "; ".join([*own, *states, "*Serialized*", "fmu_mesh_guest_limits"])
     (folder / "functions").write_text(f"{{ global: {visible}; local: *; }};\n", encoding="utf-8")
-    library = Path(wasmtime.__file__).parent.glob("*/_libwasmtime.so")
-    found = next(library, None)
+    package = Path(str(metadata.distribution("wasmtime").locate_file("wasmtime")))
+    found = next(package.glob("*/_libwasmtime.so"), None)
     if found is None:
         raise LoadFailed("wasmtime has no library for this platform.")
     options += [f'-DPREFIX="{prefix}"', f'-DIDENTITY="{draft.parents[1].name}"', f"-I{folder}"]
-    run([
-        *cc,
-        *_HOST_FLAGS,
-        *options,
-        str(FOLDER / "host.c"),
-        str(found),
-        f"-Wl,-rpath,{found.parent}",
-        f"-Wl,--version-script={folder / 'functions'},--undefined-version",
-        "-o",
-        str(draft),
-    ])
+    run(
+        [
+            *cc,
+            *_HOST_FLAGS,
+            *options,
+            str(FOLDER / "host.c"),
+            str(found),
+            f"-Wl,-rpath,{found.parent}",
+            f"-Wl,--version-script={folder / 'functions'},--undefined-version",
+            "-o",
+            str(draft),
+        ]
+    )
 
 
-def _compiled(wasmtime: ModuleType, module: bytes) -> wasmtime.Module:  # type: ignore[name-defined]  # it is a parameter
+def _compiled(module: bytes) -> wasmtime.Module:
     """A module, compiled for this processor as `host.c` runs it."""
+    import wasmtime  # noqa: PLC0415  an optional library
+
     config = wasmtime.Config()
     config.epoch_interruption = True
     try:

@@ -651,6 +651,18 @@ FUNCTION(fmi3GetDirectionalDerivative,
          IN(known, n_known * 4), I(n_known), IN(seed, n_seed * 8), I(n_seed), OUT(x, m * 8), I(m))
 VECTOR(fmi3GetContinuousStateDerivatives, OUT, )
 
+#define NUMBER_OF(THINGS) \
+    OURS int32_t fmi3GetNumberOf##THINGS(Guest *g, size_t *n) \
+    { \
+        uint32_t own = 0; /* a size_t of the guest */ \
+        int32_t status = pass(g, __COUNTER__, "fmi3GetNumberOf" #THINGS, LIST(TO(&own))); \
+        *n = own; \
+        return status; \
+    }
+
+NUMBER_OF(ContinuousStates)
+NUMBER_OF(EventIndicators)
+
 OURS int32_t fmi3GetBinary(REFERENCES, size_t *sizes, const void **x, size_t m)
 {
     return get_blocks(g, __COUNTER__, "fmi3GetBinary", r, n, sizes, x, m);
