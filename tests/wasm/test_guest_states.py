@@ -125,7 +125,7 @@ def test_a_state_of_other_sources_is_refused(tmp_path: Path) -> None:
         second.open(state=file)
 
 
-def test_a_state_is_that_of_the_instance_only_where_it_is_the_same(tmp_path: Path) -> None:
+def test_each_state_has_its_own_values(tmp_path: Path) -> None:
     with meshed(rogue(tmp_path), start_values={"u": 2.0}).open() as system:
         states = []
         for value in (1.0, 5.0):

@@ -6,9 +6,10 @@ the module in it, as wasmtime has compiled it for this processor, and calls the 
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import sys
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -55,6 +56,8 @@ def compiler(*, plus: bool) -> list[str]:
         LibraryMissing: ziglang or wasmtime is not installed.
         LoadFailed: wasmtime has another version.
     """
+    from importlib import metadata  # noqa: PLC0415  slow, and only guests need it
+
     require("ziglang", _USERS)
     require("wasmtime", _USERS)
     version = metadata.version("wasmtime")
@@ -88,7 +91,7 @@ def make_library(
     run([*command, str(shim), *_REACTOR, "-o", str(module)])
     compiled = _compiled(module.read_bytes())
     (folder / "module.bin").write_bytes(compiled.serialize())
-    names = [export.name for export in compiled.exports if "fmi" in export.name]
+    names = [export.name for export in compiled.exports if re.fullmatch(r"\w*fmi\w+", export.name)]
     prefix = next((name.partition("fmi")[0] for name in names if name.endswith("fmi2Instantiate")), "")
     own = [name.removeprefix(prefix) for name in names]
     states = [
@@ -96,9 +99,9 @@ def make_library(
     ]
     visible = "; ".join([*own, *states, "*Serialized*", "fmu_mesh_guest_limits"])
     (folder / "functions").write_text(f"{{ global: {visible}; local: *; }};\n", encoding="utf-8")
-    package = Path(str(metadata.distribution("wasmtime").locate_file("wasmtime")))
-    found = next(package.glob("*/_libwasmtime.so"), None)
-    if found is None:
+    spec = importlib.util.find_spec("wasmtime")
+    package = Path(spec.origin or "").parent if spec is not None else Path()
+    if (found := next(package.glob("*/_libwasmtime.so"), None)) is None:
         raise LoadFailed("wasmtime has no library for this platform.")
     options += [f'-DPREFIX="{prefix}"', f'-DIDENTITY="{draft.parents[1].name}"', f"-I{folder}"]
     run(
