@@ -24,6 +24,7 @@ FAULTS = {
     "divide": "s->y = 7 / zero;",
     "file": 's->y = fopen("/etc/passwd", "r") != NULL || fopen("relative", "w") != NULL || getenv("PATH") != NULL;',
     "printed": 'printf("%f\\n", time); s->y = printf("x");',
+    "slept": "sleep(3600); s->y = 1.0;",
     "pointer": "kept = (void *)calculate; s->y = ((double (*)(double, int))kept)(1.0, 2);",
 }
 """What the model does in each step from 0.5 s on, by the number of the fault in `k`."""
@@ -32,6 +33,7 @@ _STEP = """
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 static void *volatile kept;
 static volatile int zero;
 static int deeper(int n) { volatile char room[4096]; room[n % 4096] = 1; return n ? deeper(n - 1) + room[1] : 0; }

@@ -68,8 +68,10 @@ def test_a_fault_in_a_node_ends_the_run_with_names(place: Place, fault: str) -> 
     place.assert_nothing_left()
 
 
-@pytest.mark.parametrize("fault", ["file", "printed"])
-def test_a_guest_has_no_files_and_no_output(tmp_path: Path, fault: str, capfd: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("fault", ["file", "printed", "slept"])
+def test_a_guest_has_no_files_no_output_and_no_sleep(
+    tmp_path: Path, fault: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     mesh = meshed(rogue(tmp_path), start_values={"k": NUMBERS[fault]})
 
     result = mesh.run(processes=False, record="memory")

@@ -53,6 +53,7 @@ void wasmtime_module_delete(Module *);
 Linker *wasmtime_linker_new(Engine *);
 void wasmtime_linker_delete(Linker *);
 Error *wasmtime_linker_define_wasi(Linker *);
+void wasmtime_linker_allow_shadowing(Linker *, bool);
 typedef Trap *Import(void *, void *caller, Raw *, size_t);
 Error *wasmtime_linker_define_func_unchecked(Linker *, const char *, size_t, const char *, size_t, const Type *, Import *,
                                              void *, void (*)(void *));
@@ -386,15 +387,27 @@ static Trap *out_of_memory_from(void *unused, void *caller, Raw *arguments, size
 
 /* ---- its life */
 
-static Error *imported(const char *name, size_t n, Import *function)
+/* To sleep is no call that the clock of wasmtime could end. */
+static Trap *no_sleep(void *unused, void *caller, Raw *arguments, size_t n)
 {
-    Types types;
+    enum { NOT_SUPPORTED = 58 };
+
+    (void)unused, (void)caller, (void)n;
+    arguments[0].i = NOT_SUPPORTED;
+    return NULL;
+}
+
+static Error *imported(const char *from, const char *name, size_t n, size_t n_results, Import *function)
+{
+    Types types, results;
     Error *error;
 
     wasm_valtype_vec_new_uninitialized(&types, n);
     for (size_t i = 0; i < n; ++i) types.data[i] = wasm_valtype_new(I32);
-    Type *type = wasm_functype_new(&types, &(Types){0, NULL}); /* takes them */
-    error = wasmtime_linker_define_func_unchecked(linker, "fmu_mesh", 8, name, strlen(name), type, function, NULL, NULL);
+    wasm_valtype_vec_new_uninitialized(&results, n_results);
+    for (size_t i = 0; i < n_results; ++i) results.data[i] = wasm_valtype_new(I32);
+    Type *type = wasm_functype_new(&types, &results); /* takes them */
+    error = wasmtime_linker_define_func_unchecked(linker, from, strlen(from), name, strlen(name), type, function, NULL, NULL);
     wasm_functype_delete(type);
     return error;
 }
@@ -411,8 +424,11 @@ static Error *begin(void)
         wasmtime_config_epoch_interruption_set(config, true);
         engine = wasm_engine_new_with_config(config);
         linker = wasmtime_linker_new(engine);
-        (void)((error = wasmtime_linker_define_wasi(linker)) || (error = imported("log", 3, log_from)) ||
-               (error = imported("out_of_memory", 1, out_of_memory_from)));
+        wasmtime_linker_allow_shadowing(linker, true);
+        (void)((error = wasmtime_linker_define_wasi(linker)) ||
+               (error = imported("wasi_snapshot_preview1", "poll_oneoff", 4, 1, no_sleep)) ||
+               (error = imported("fmu_mesh", "log", 3, 0, log_from)) ||
+               (error = imported("fmu_mesh", "out_of_memory", 1, 0, out_of_memory_from)));
     }
     if (error == NULL && module == NULL)
         error = wasmtime_module_deserialize(engine, module_bytes, sizeof module_bytes, &module);
