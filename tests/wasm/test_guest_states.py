@@ -9,20 +9,22 @@ import numpy as np
 import pytest
 
 import fmu_mesh
-from tests.fmus.event_fmus import Version, event_source_fmu
+from tests.fmus.event_fmus import Version, build_event_fmu, event_source_fmu
 from tests.fmus.helpers import FMUS
 from tests.fmus.packing import repacked
 from tests.helpers import Place, rows_of, write_config
+from tests.solved_systems import LINKS, masses
 from tests.wasm.guests import SANDBOX, meshed, rogue
 
 
 def stateless(folder: Path, name: str = "TransportDelay") -> Path:
-    """An FMU that grows its memory, without the functions and the flags for states."""
+    """An FMU that grows its memory, without the flags for states."""
 
-    def forgets(text: str) -> str:
-        return text.replace('canGetAndSetFMUstate="true"', "").replace('canSerializeFMUstate="true"', "")
+    return repacked(folder / f"{name}.fmu", source=FMUS / f"{name}.fmu", description=_without_flags)
 
-    return repacked(folder / f"{name}.fmu", source=FMUS / f"{name}.fmu", description=forgets)
+
+def _without_flags(text: str) -> str:
+    return text.replace('canGetAndSetFMUstate="true"', "").replace('canSerializeFMUstate="true"', "")
 
 
 def delayed(folder: Path) -> fmu_mesh.Mesh:
@@ -92,6 +94,26 @@ def test_states_hold_events_too(
         system.restore(state)
         system.step(6)
         assert (system.get("one.h"), system.get("one.bounces")) == expected
+
+
+def test_a_solved_group_takes_steps_of_guests_again(tmp_path: Path) -> None:
+    native = build_event_fmu("LinearPart", 2, tmp_path)
+    guest = event_source_fmu("LinearPart", 2, tmp_path / "guest.fmu", _without_flags)
+    results = []
+    for fmu, process in ((native, "none"), (guest, "wasm")):
+        config = write_config(
+            tmp_path,
+            name=process,
+            instances=masses(fmu),
+            connections=LINKS,
+            process={"sandbox": process},
+            simulation={"step_size": 0.01},
+        )
+        results.append(fmu_mesh.load(config).run(processes=False, record="memory"))
+
+    assert list(results[0]) == list(results[1])
+    for variable in results[0]:
+        np.testing.assert_array_equal(results[1][variable], results[0][variable])
 
 
 def test_a_killed_node_goes_on_from_a_checkpoint(place: Place) -> None:

@@ -286,7 +286,7 @@ typedef struct {
 static inline __attribute__((always_inline)) int32_t pass(Guest *g, int slot, const char *name, const Argument *arguments, size_t n)
 {
     Raw raw[16];
-    size_t all = 0, used = (size_t)0;
+    size_t all = 0, used = 0;
 
     if (g->is_lost) return ERROR;
     for (size_t i = 0; i < n; ++i) all += ALIGNED(arguments[i].bytes);
