@@ -19,7 +19,6 @@ from tests.wasm.guests import SANDBOX, meshed, rogue
 
 def stateless(folder: Path, name: str = "TransportDelay") -> Path:
     """An FMU that grows its memory, without the flags for states."""
-
     return repacked(folder / f"{name}.fmu", source=FMUS / f"{name}.fmu", description=_without_flags)
 
 
