@@ -355,6 +355,7 @@ ALLOWED: dict[str, dict[str, str]] = {
         "instances/fmi/callbacks.py: callbacks.logger": _C_STRUCT,
         "instances/fmi/callbacks.py: callbacks.stepFinished": _C_STRUCT,
         "instances/fmi/fmu_library.py: entry.name": _C_STRUCT,
+        "instances/fmi/webassembly/compiling.py: config.epoch_interruption": "wasmtime has no other way to set it",
         **{f"node/burst_engine.py: member.{name}": _C_STRUCT for name in ("python_at", "stage", "tracks_from")},
         **{f"node/engine.py: member.{name}": _C_STRUCT for name in ("stage", "step")},
         **{f"node/engine.py: place.{name}": _C_STRUCT for name in ("last_tick", "next", "spent_ns", "stopped", "tick")},

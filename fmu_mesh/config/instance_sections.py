@@ -150,10 +150,11 @@ class ProcessConfig(Base, frozen=True, kw_only=True):
         ),
     ] = None
     sandbox: Annotated[
-        Literal["none", "bubblewrap"] | None,
+        Literal["none", "bubblewrap", "wasm"] | None,
         Meta(
             description="bubblewrap: without the network, other processes, and all files but the model and those of "
-            "the system, which it can only read."
+            "the system, which it can only read; wasm: sources of an FMU are compiled for WebAssembly and run in "
+            "wasmtime, without files and network, and with `memory`, or 1 GiB, of its own."
         ),
     ] = None
 
@@ -174,6 +175,13 @@ class ProcessConfig(Base, frozen=True, kw_only=True):
     def is_sandboxed(self) -> bool:
         """Whether the node runs in a sandbox."""
         return self.sandbox == "bubblewrap"
+
+    @property
+    def of_node(self) -> ProcessConfig:
+        """What is for the process of the node: a sandbox of WebAssembly, and its memory, are within it."""
+        if self.sandbox == "bubblewrap":
+            return self
+        return replace(self, sandbox=None, memory=None if self.sandbox == "wasm" else self.memory)
 
     def over(self, general: ProcessConfig) -> ProcessConfig:
         """This section, with what a more general one says where this one says nothing."""

@@ -25,6 +25,7 @@ from fmu_mesh.config.instance_sections import (
     InstanceSection,
     PhysicsSection,
     ProcessConfig,
+    placed,
 )
 from fmu_mesh.config.key_sections import KEY, KeyInputConfig, KeyOutputConfig
 from fmu_mesh.config.ros_section import ConstantFile, Qos, RosConfig, RosProfile, RosTopicConfig
@@ -361,6 +362,12 @@ class Config(Base, frozen=True, kw_only=True):
     def process_of(self, section: InstanceSection) -> ProcessConfig:
         """What the process of the node of an instance may take."""
         return (section.process or ProcessConfig()).over(self.process)
+
+    def model_section(self, section: InstanceSection) -> InstanceSection:
+        """A section without the common keys, but with the sandbox of an FMU: that decides what is loaded."""
+        process = self.process_of(section)
+        is_apart = section.follows_fmi and process.sandbox not in {None, "none"}
+        return placed(section, process=process if is_apart else None)
 
     def is_strict(self, section: InstanceSection) -> bool:
         """Whether a violation of FMI is an error, and not a warning, for an instance of this mesh."""

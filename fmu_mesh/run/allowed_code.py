@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..config.findings import Findings
-from ..config.instance_sections import InstanceSection, key_of, placed
+from ..config.instance_sections import InstanceSection, key_of
 from ..config.loading import LoadedConfig
 from ..config.mesh import LimitsConfig
 from ..errors import ConfigurationError
@@ -49,7 +49,7 @@ def check_code(
             is_apart = not section.follows_fmi or loaded.config.process_of(section).is_sandboxed
             if not source or allowed or is_apart or not section.path:
                 continue
-            if compiles(loaded.resolve(section.path), placed(section), loaded.config.limits):
+            if compiles(loaded.resolve(section.path), loaded.config.model_section(section), loaded.config.limits):
                 expected = "a binary for this platform, or `allow_code=True`"
                 findings.add(f"instances.{name}.{key_of(section)}", f"sources to compile, in {source}", expected)
             continue

@@ -69,7 +69,7 @@ def apart(plan: Plan) -> list[str]:
 def limited(plan: Plan) -> list[str]:
     """The instances of a plan that `process` gives limits or a sandbox, which only a process of their own has."""
     config = plan.system.config
-    named = [name for name, own in config.instances.items() if config.process_of(own) != ProcessConfig()]
+    named = [name for name, own in config.instances.items() if config.process_of(own).of_node != ProcessConfig()]
     return [f"`process` limits '{name}', which needs a process of its own for that" for name in named]
 
 

@@ -80,7 +80,7 @@ class KnownModels:
         known, config = cls(keeps_code=True), run.loaded.config
         for name, own in run.plan.system.instances.items():
             if not own.description.with_causality("structuralParameter"):
-                section = placed(config.instances[name])
+                section = config.model_section(config.instances[name])
                 path = run.loaded.resolve(section.path) if section.path else Path()
                 model = "description", os.path.realpath(path), msgspec.json.encode((section, config.limits))
                 known._models[model] = run.contents[name], own.description
@@ -213,6 +213,10 @@ def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None
     elsewhere = {name: bool(section.host or section.interpreter) for name, section in own.items()}
     if elsewhere and (why := why_no_sandbox(config.zenoh, elsewhere)) is not None:
         obstacles.add("process.sandbox", *why)
+    for name, section in config.instances.items():
+        if config.process_of(section).sandbox == "wasm" and not section.follows_fmi:
+            found = f"wasm for '{name}', which is no FMU and has no sources for a compiler of C"
+            obstacles.add(f"instances.{name}.process.sandbox", found, "`sandbox: none` for this instance")
     if (problem := config.recovery_problem) is not None:
         obstacles.add(*problem)
     if (group := config.runtime.share_with) is not None:
@@ -284,8 +288,7 @@ def _descriptions(
             if not any(f"{other}.".startswith(f"instances.{name}.") for other in known_places):
                 findings.append(loaded.finding(place, "an empty path", expected_model(section)))
             continue
-        process = loaded.config.process_of(section)
-        own = placed(section, process=process if section.follows_fmi and process.is_sandboxed else None)
+        own = loaded.config.model_section(section)
         path = loaded.resolve(section.path) if section.path else Path()
         model = (path, msgspec.json.encode(own))
         if model not in cache:

@@ -372,7 +372,7 @@ def _nodes(plan: Plan, outputs: Mapping[str, Layout], links: Sequence[Link]) -> 
             shared_memory=config.zenoh.shared_memory,
             row_streams=config.row_streams,
             secured=config.security is not None,
-            process=config.process_of(config.instances[members[0]]) if members else ProcessConfig(),
+            process=config.process_of(config.instances[members[0]]).of_node if members else ProcessConfig(),
             host=config.deploy.known(config.instances[members[0]].host) if members else None,
             saves=not plan.played or node in plan.played,
         )

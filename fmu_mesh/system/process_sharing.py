@@ -88,7 +88,7 @@ def _together(config: Config, cycle: Sequence[str], claims: ClaimsOf) -> Iterabl
     parts: list[tuple[object, SharedProcess, list[str]]] = []
     for name in cycle:
         section = config.instances[name]
-        where = (section.host, section.interpreter, config.process_of(section))
+        where = (section.host, section.interpreter, config.process_of(section).of_node)
         own = partial(claims, name)
         part = next((part for part in parts if part[0] == where and part[1].refusal(name, own) is None), None)
         if part is None:

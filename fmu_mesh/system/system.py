@@ -394,7 +394,7 @@ def _check_nodes(
             found = f"the group '{group}', which is the name of an instance outside the group"
             findings.add(path, found, "a name of its own")
         with_code = first_with_code.setdefault(group, name) if instance.names_code else name
-        own, theirs = config.process_of(instance), config.process_of(config.instances[first])
+        own, theirs = (config.process_of(one).of_node for one in (instance, config.instances[first]))
         for what, other, mine, others in (
             ("host", first, instance.host, config.instances[first].host),
             ("process", first, msgspec.to_builtins(own), msgspec.to_builtins(theirs)),

@@ -173,6 +173,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     Attributes:
         kind: a `Kind` of FMU, or in one word what the model is: physics_engine, controller, ...
         library: the file of the FMU that is loaded on this platform; None if it is compiled, or nothing is loaded.
+        guest_memory: the memory in bytes of the sandbox of WebAssembly that it runs in; None: it runs in none.
         fixed_step_size: that of its solver in s, if it has a fixed one (FMI 3.0, 4.3.1, fixedInternalStepSize). An FMU
             may take other steps, with a warning; for what is no FMU they are refused.
         not_repeatable: why two runs may differ, for a warning of `check`; None: they do not.
@@ -204,6 +205,7 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     kinds: tuple[Kind, ...] = ()
     problems: tuple[str, ...] = ()
     library: str | None = None
+    guest_memory: int | None = None
     fixed_step_size: float | None = None
     not_repeatable: str | None = None
     states: tuple[str, ...] = ()

@@ -119,7 +119,7 @@ class FmuInstance(ABC):
         # In FMI 1.0, the names of functions begin with the model identifier (FMI 1.0 CS, 3.1).
         self._symbols = f"{description.model_identifier}_{prefix}" if prefix == "fmi" else prefix
         self._kept = kept
-        fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding)
+        fmu = FmuToLoad(path, name, description, terms, self._functions, options.deep_binding, options.timeouts)
         left = cast("LoadedFmu | None", kept.take(name, fmu.key)) if kept is not None else None
         self._model = left or LoadedFmu(fmu, folder if kept is None else kept.folder)
         if left is None and kept is not None:

@@ -41,6 +41,8 @@ from .step_options import NO_STATE_OF_CVODE, SolverName, SolverSettings, StepOpt
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
 _DEFAULT_TOLERANCE = 1e-6
+_GUEST_MEMORY = 1 << 30
+"""How much memory an FMU in a sandbox of WebAssembly has without `memory`, in bytes."""
 
 
 class SolverConfig(Base, frozen=True, kw_only=True):
@@ -218,7 +220,7 @@ class FmuKind(Kind[FmuConfig]):
     ) -> ModelDescription:
         """Read the model description; compile the FMU if it has no binary for this platform.
 
-        What runs in a sandbox is compiled there: a source can include any file that the compiler can read.
+        What runs in a sandbox of bubblewrap is compiled there: a source can include any file that a compiler can read.
         """
         from .archive.reading import read_description  # noqa: PLC0415  FMPy is slow to import
         from .archive.sources import describe  # noqa: PLC0415  as above
@@ -226,13 +228,13 @@ class FmuKind(Kind[FmuConfig]):
         terms = Terms(limits, section.sha256)
         if section.process is not None and section.process.is_sandboxed:
             return read_description(path, terms, section.kind)
-        return describe(path, terms, section.kind, tell)
+        return describe(path, terms, section.kind, tell, _guest_memory(section))
 
     def needs_compiler(self, path: Path, section: FmuConfig, limits: LimitsConfig) -> bool:
         """Whether it has neither a binary for this platform, nor one that was compiled before."""
         from .archive.sources import needs_compiler  # noqa: PLC0415  as above
 
-        return needs_compiler(path, Terms(limits, section.sha256), section.kind)
+        return needs_compiler(path, Terms(limits, section.sha256), section.kind, _guest_memory(section))
 
     def check_model(self, path: Path, description: ModelDescription, limits: LimitsConfig) -> None:
         """Look for the libraries of the system that the FMU needs."""
@@ -288,6 +290,7 @@ class FmuKind(Kind[FmuConfig]):
             retry_discarded_steps=section.retry_discarded_steps,
             linear_inputs=opening.linear_inputs,
             deep_binding=section.deep_binding,
+            timeouts=opening.timeouts,
         )
         path, folder, terms = opening.path, opening.folder, Terms(opening.limits, section.sha256, opening.content)
         instance = open_instance(path, opening.name, description, folder, opening.log, terms, options, opening.kept)
@@ -295,6 +298,12 @@ class FmuKind(Kind[FmuConfig]):
 
 
 KIND_OF_FMUS = FmuKind()  # what the entry point `fmu` names
+
+
+def _guest_memory(section: FmuConfig) -> int | None:
+    """The memory of its sandbox of WebAssembly in bytes; None if it has none."""
+    own = section.process
+    return (own.memory_bytes or _GUEST_MEMORY) if own is not None and own.sandbox == "wasm" else None
 
 
 def _takes_no_tolerance(description: ModelDescription) -> tuple[str, str] | None:

@@ -5,6 +5,7 @@ Owns the files, the library and the instance as FMPy has it; `FmuInstance` calls
 
 from __future__ import annotations
 
+import ctypes
 import re
 import shutil
 from collections.abc import Callable, Hashable, Mapping
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 from fmpy.fmi1 import FMICallException
 
+from ...config.mesh import TimeoutsConfig
 from ...variables.model_description import ModelDescription
 from ..call_guard import call_named
 from ..process_end import process_ends
@@ -58,12 +60,14 @@ class FmuToLoad(NamedTuple):
     terms: Terms
     functions: FmuFunctions
     deep_binding: bool
+    timeouts: TimeoutsConfig
 
     @property
     def key(self) -> Hashable:
         """Two FMUs with the same key are the same, for instances of one name."""
         own = self.description
-        return self.path, self.terms, own.guid, own.model_identifier, self.functions.library, self.deep_binding
+        made = own.guid, own.model_identifier, self.functions.library, own.guest_memory
+        return self.path, self.terms, made, self.deep_binding
 
 
 class _Files:
@@ -150,6 +154,9 @@ class LoadedFmu:
         path = self._folder / library_name(description.model_identifier, description.fmi_version, [description.library])
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
             library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
+            if description.guest_memory is not None:
+                memory, limits = ctypes.c_int64(description.guest_memory), self._fmu.timeouts
+                library.fmu_mesh_guest_limits(memory, ctypes.c_double(limits.call), ctypes.c_double(limits.step))
             return calling(functions.library)(
                 library=library,
                 environment=id(self),

@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 import msgspec
 
-from ...config.mesh import LimitsConfig
+from ...config.mesh import LimitsConfig, TimeoutsConfig
 from ...system.linear_inputs import LinearInput
 
 __all__ = ["NO_STATE_OF_CVODE", "SolverName", "SolverSettings", "StepOptions", "Terms"]
@@ -42,3 +42,4 @@ class StepOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     retry_discarded_steps: bool = False  # whether a step that the FMU discards is repeated in smaller steps
     linear_inputs: tuple[LinearInput, ...] = ()  # the inputs whose connections are extrapolated
     deep_binding: bool = True  # whether the library finds its own functions and variables before those of the process
+    timeouts: TimeoutsConfig = TimeoutsConfig()  # how long its calls may take, if it runs in WebAssembly

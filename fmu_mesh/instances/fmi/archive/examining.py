@@ -24,6 +24,11 @@ from .repairing import repair
 __all__ = ["examine", "find_library", "library_folders", "library_name", "names_here", "source_names"]
 
 _SHOWN: Final = 3
+_EXPORT: Final = "Export it for this platform, or with its sources."
+_COMPONENT: Final = (
+    "Its binary for WebAssembly is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with "
+    "its sources, which `process: {sandbox: wasm}` compiles for WebAssembly."
+)
 _SUFFIX: Final = str(fmpy.sharedLibraryExtension)
 
 _ARM: Final = "aarch64-linux"
@@ -154,5 +159,5 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "
         f"{', '.join(platforms) or 'no platform at all'}.",
-        hint="Export it for this platform, or with its sources.",
+        hint=_COMPONENT if any(name.startswith("wasm") for name in platforms) else _EXPORT,
     )

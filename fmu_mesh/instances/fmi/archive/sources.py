@@ -26,12 +26,14 @@ from typing import Final, Literal
 import fmpy
 import msgspec
 from fmpy.model_description import ModelDescription as FmpyDescription
+from msgspec.structs import replace
 
 from .... import files
 from ....archives.archive_entries import reading
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from ..step_options import Terms
+from ..webassembly import compiling
 from .archive import OpenFmu, in_new_folder, opened
 from .examining import examine, library_folders, library_name, source_names
 from .library_names import rename_libraries
@@ -68,7 +70,7 @@ _OWN_VARIABLES: Final = "-fno-gnu-unique"
 _LINK_FLAGS: Final = ("-shared", "-Wl,--no-undefined", "-Wl,-Bsymbolic", "-lm", "-ldl", "-lpthread")
 
 
-_prepared: dict[tuple[Path, Terms, str, str], Path] = {}
+_prepared: dict[tuple[Path, Terms, str, str, int | None], Path] = {}
 """The folders of FMUs that `prepare` has extracted."""
 _linked: set[Path] = set()
 """Those whose files this process uses, as they are also those of other processes."""
@@ -82,6 +84,7 @@ class _Build(msgspec.Struct, frozen=True):
     sources: tuple[str, ...]  # paths relative to the folder `sources` of the FMU
     includes: tuple[str, ...]
     options: tuple[str, ...]
+    is_guest: bool  # whether for WebAssembly
 
 
 def extract(
@@ -97,7 +100,7 @@ def extract(
     ``model`` says for which kind; without it, the library is for co-simulation if the FMU has that. After `LoadFailed`
     nothing is left behind.
     """
-    if model is not None and (prepared := _prepared.get((path, terms, model.model_identifier, model.kind))) is not None:
+    if model is not None and (prepared := _prepared.get(_key_of(path, terms, model))) is not None:
         folder = _copied(path, prepared, parent)
     else:
         with opened(path, terms) as fmu:
@@ -111,9 +114,13 @@ def prepare(path: Path, parent: Path, terms: Terms, model: ModelDescription) -> 
 
     Each has a folder of its own, because an FMU may write to its files.
     """
-    key = (path, terms, model.model_identifier, model.kind)
+    key = _key_of(path, terms, model)
     if key not in _prepared:
         _prepared[key] = extract(path, parent, terms, model=model)
+
+
+def _key_of(path: Path, terms: Terms, model: ModelDescription) -> tuple[Path, Terms, str, str, int | None]:
+    return path, terms, model.model_identifier, model.kind, model.guest_memory
 
 
 def _copied(path: Path, prepared: Path, parent: Path) -> Path:
@@ -143,26 +150,33 @@ def _copied(path: Path, prepared: Path, parent: Path) -> Path:
     return in_new_folder(path, parent, size, fill)
 
 
-def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]) -> ModelDescription:
+def describe(
+    path: Path,
+    terms: Terms,
+    kind: Literal["auto"] | Kind,
+    tell: Callable[[str], None],
+    guest_memory: int | None = None,
+) -> ModelDescription:
     """Read the model description of an FMU and get it ready to run, while its archive is open once.
 
-    If it has no library for this platform, its sources are compiled into the cache; ``tell`` is called before that.
+    If it has no library for this platform, or is to run in a sandbox of WebAssembly with so many bytes of
+    ``guest_memory``, its sources are compiled into the cache; ``tell`` is called before that.
     Its SHA-256 is known afterwards, so that `content_of` does not read it again. If its sources do not compile,
     `LoadFailed` has the first lines of the compiler.
     """
     with opened(path, terms) as fmu:
         fmu.content_sha256()
-        model = description_of(fmu, kind)
+        model = _model_of(fmu, kind, guest_memory)
         if model.library is None:
             with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, reading(path):
                 _fill(fmu, tell, model, Path(folder))
     return model
 
 
-def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind) -> bool:
+def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind, guest_memory: int | None = None) -> bool:
     """Whether `describe` would compile what nobody has compiled before; nothing is."""
     with opened(path, terms) as fmu:
-        model = description_of(fmu, kind)
+        model = _model_of(fmu, kind, guest_memory)
         if model.library is not None:
             return False
         with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as name, reading(path):
@@ -170,6 +184,11 @@ def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind) -> bo
             fmu.unpack_into(folder)
             build = _build_of(fmu, folder, model)
             return build is not None and not _command(path, folder / "sources", build)[1].is_file()
+
+
+def _model_of(fmu: OpenFmu, kind: Literal["auto"] | Kind, guest_memory: int | None) -> ModelDescription:
+    model = description_of(fmu, kind)
+    return model if guest_memory is None else compiling.as_guest(fmu.path, model, guest_memory)
 
 
 def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | None, folder: Path) -> None:
@@ -192,6 +211,8 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
 def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tell: Callable[[str], None]) -> None:
     """Copy the compiled library of an FMU to where FMI expects it."""
     if (build := _build_of(fmu, folder, model)) is None:
+        if model is not None and model.guest_memory is not None:
+            raise LoadFailed(f"'{fmu.path}' has no sources, which `sandbox: wasm` needs.")
         return  # the error of loading it says what is missing
     library = _compiled(fmu.path, folder / "sources", build, tell)
     target = folder / library_name(build.identifier, build.fmi_version)
@@ -207,7 +228,8 @@ def _build_of(fmu: OpenFmu, folder: Path, model: ModelDescription | None) -> _Bu
     path, (contents, root, _) = fmu.path, examine(fmu)
     description = parsed(path, contents)
     kind = model.kind if model is not None else "co_simulation" if description.coSimulation else "model_exchange"
-    return _build(path, description, names, kind, _listed_files(root, kind))
+    build = _build(path, description, names, kind, _listed_files(root, kind))
+    return build if model is None or model.guest_memory is None else replace(build, is_guest=True)
 
 
 def _listed_files(root: ET.Element, kind: str) -> list[str]:
@@ -251,7 +273,9 @@ def _build(path: Path, description: FmpyDescription, names: Sequence[str], kind:
         (language,) = languages
         if re.fullmatch(r"C(\+\+)?\d\d", language):
             options.append(f"-std={language.lower().replace('c', 'gnu', 1)}")
-    return _Build(str(description.fmiVersion), identifier, tuple(sources), tuple(includes), tuple(options))
+    return _Build(
+        str(description.fmiVersion), identifier, tuple(sources), tuple(includes), tuple(options), is_guest=False
+    )
 
 
 def _inside(path: Path, name: str) -> str:
@@ -267,7 +291,8 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
     own, target = _command(path, sources, build)
     if target.is_file():
         return target
-    tell(f"'{path}' has no binary for this platform ({_PLATFORM}): compiling its sources into '{target.parent}'")
+    why = "runs in a sandbox" if build.is_guest else f"has no binary for this platform ({_PLATFORM})"
+    tell(f"'{path}' {why}: compiling its sources into '{target.parent}'")
     try:
         target.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:
@@ -275,6 +300,12 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
             folders = [sources, *(sources / name for name in build.includes), _OWN_HEADERS, _HEADERS]
             searched = [f"-I{folder}" for folder in folders] + _other_folders(sources)
             inputs = [str(sources / name) for name in build.sources]
+            if build.is_guest:
+                run = partial(_run, path, folder=Path(scratch))
+                compiling.make_library(build.fmi_version, build.identifier, [*own, *searched, *inputs], draft, run)
+                draft.chmod(0o600)
+                draft.replace(target)
+                return target
             command = [*own, *searched, "-o", str(draft), *inputs, *_LINK_FLAGS]
             _run(path, command, Path(scratch))
             if prefixed := _prefixed(draft.read_bytes()):
@@ -292,12 +323,15 @@ def _compiled(path: Path, sources: Path, build: _Build, tell: Callable[[str], No
 def _command(path: Path, sources: Path, build: _Build) -> tuple[list[str], Path]:
     """How sources are compiled, without their names, and where in the cache their library is."""
     plus = any(not name.endswith(".c") for name in build.sources)
-    try:
-        compiler = find_compiler(plus=plus)
-    except LoadFailed as error:
-        text = f"'{path}' has no binary for this platform ({fmpy.platform}) but sources, and {error.message}."
-        raise LoadFailed(text, hint=error.hint) from None
-    own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
+    if build.is_guest:
+        own = [*compiling.compiler(plus=plus), *(() if plus else _FLAGS_OF_C), *build.options]
+    else:
+        try:
+            compiler = find_compiler(plus=plus)
+        except LoadFailed as error:
+            text = f"'{path}' has no binary for this platform ({_PLATFORM}) but sources, and {error.message}."
+            raise LoadFailed(text, hint=error.hint) from None
+        own = [*compiler, *_FLAGS, *(_flags_of_cpp(compiler) if plus else _FLAGS_OF_C), *build.options]
     target = (
         files.cache_folder()
         / "sources"
@@ -341,7 +375,13 @@ def _flags_of_cpp(compiler: Sequence[str]) -> list[str]:
 def _run(path: Path, command: Sequence[str], folder: Path) -> None:
     try:
         done = subprocess.run(
-            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=COMPILE_S
+            command,
+            cwd=folder,
+            env=os.environ | compiling.environment(),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            check=False,
+            timeout=COMPILE_S,
         )
     except subprocess.TimeoutExpired as error:
         raise LoadFailed(f"the sources of '{path}' were not compiled within {COMPILE_S:g} s.") from error
@@ -374,9 +414,9 @@ def find_compiler(*, plus: bool) -> list[str]:
 def _key(sources: Path, build: _Build, command: Sequence[str]) -> str:
     """The hash of everything that a library is made from."""
     digest = hashlib.sha256(msgspec.json.encode([build, command, fmpy.__version__, fmpy.platform_tuple]))
-    for folder in (sources, _OWN_HEADERS):
+    for folder in (sources, _OWN_HEADERS, *((compiling.FOLDER,) if build.is_guest else ())):
         for file in sorted(folder.rglob("*")):
-            if file.is_file():
+            if file.is_file() and file.suffix != ".pyc":
                 content = file.read_bytes()
                 digest.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode())
                 digest.update(content)
