@@ -85,13 +85,13 @@ def require_compiler() -> None:
     Raises:
         BuildError: it is missing, or another version is installed.
     """
-    pinned = re.findall(r'"ziglang==([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    pinned = {*re.findall(r'"ziglang==([\d.]+)"', (ROOT / "pyproject.toml").read_text(encoding="utf-8"))}
     try:
         installed = importlib.metadata.version("ziglang")
     except importlib.metadata.PackageNotFoundError:
         installed = "none"
-    if [installed] != pinned:
-        needed = ", ".join(pinned)
+    if {installed} != pinned:
+        needed = ", ".join(sorted(pinned))
         raise BuildError(
             f"the library is built by ziglang {needed}; installed: {installed}. `make library` installs it"
         )

@@ -41,6 +41,7 @@ USERS: Final[Mapping[str, str]] = {
     "scipy": "samplers other than random",
     "wasmtime": "FMUs in WebAssembly",
     "xxhash": "topics of rmw_zenoh",
+    "ziglang": "FMUs in WebAssembly",
 }
 """The optional libraries, and what needs each, a plural."""
 

@@ -182,7 +182,7 @@ def test_a_package_that_is_missing_is_told_as_a_run_tells_it() -> None:
 def test_each_optional_library_of_an_extra_has_its_line() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     developers = {"test", "test-ros", "check", "package", "library", "docs", "dev"}
-    needed = {line.partition(">=")[0].partition("[")[0] for name in extras.keys() - developers for line in extras[name]}
+    needed = {re.split(r"[>=\[]", line)[0] for name in extras.keys() - developers for line in extras[name]}
 
     assert needed <= USERS.keys()
     assert USERS.keys() <= checks().keys()

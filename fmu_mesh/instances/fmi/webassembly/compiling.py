@@ -31,7 +31,6 @@ FOLDER: Final = Path(__file__).parent
 WASMTIME: Final = "50."
 """The major version of wasmtime whose structures `host.c` has."""
 
-_USERS: Final = "FMUs in a sandbox of WebAssembly"
 _TARGET: Final = ("-target", "wasm32-wasi", "-O2", "-g0", "-ffp-contract=off", "-fvisibility=default")
 _REACTOR: Final = ("-mexec-model=reactor", "-rdynamic", "-Wl,--export=__stack_pointer", "-Wl,-z,stack-size=1048576")
 _HOST_FLAGS: Final = ("-std=gnu23", "-O2", "-g0", "-fPIC", "-shared", "-fvisibility=hidden")
@@ -58,8 +57,8 @@ def compiler(*, plus: bool) -> list[str]:
     """
     from importlib import metadata  # noqa: PLC0415  slow, and only guests need it
 
-    require("ziglang", _USERS)
-    require("wasmtime", _USERS)
+    require("ziglang")
+    require("wasmtime")
     version = metadata.version("wasmtime")
     if not version.startswith(WASMTIME):
         raise LoadFailed(
