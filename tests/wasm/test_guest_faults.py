@@ -55,6 +55,7 @@ def test_a_fault_in_a_node_ends_the_run_with_names(place: Place, fault: str) -> 
         timeouts={"step": 5.0},
     )
 
+    place.run("check", config)  # compiles the sources, which `launch` would tell beside the error
     launched = place.run("launch", config)
 
     assert launched.wait() != 0
