@@ -109,7 +109,7 @@ _RINGS = "return document.querySelectorAll('.fm-graph .ring').length"
 
 
 def test_edges_and_a_table_show_defects_in_both_themes(place: Place) -> None:
-    config = write_config(place.folder, stop_time=12.0, simulation={**PACED, "defects": True})
+    config = write_config(place.folder, stop_time=3600.0, simulation={**PACED, "defects": True})
     dashboard = Dashboard(place)
 
     with browser(place.folder) as page:
@@ -125,7 +125,8 @@ def test_edges_and_a_table_show_defects_in_both_themes(place: Place) -> None:
             page.show_as(theme, 1280, 800)
             wait_until(lambda: least <= _mean(page.picture(".fm-defects")) <= most, f"the {theme} theme")  # noqa: B023  called now
 
-        assert run.wait() == 0
+        place.run("stop", "pair")
+        assert run.wait() == 130
         last = Result.read(place.folder / "pair.csv").defects["pendulum.a -> delay.x"]
         text = f"by at most {last.maximum:.3g} (at t = {last.time:.12g} s), RMS {last.rms:.3g}"
         wait_until(lambda: text in page.run(_TIP), "the defect in the result file")
