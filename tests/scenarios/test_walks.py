@@ -8,12 +8,13 @@ from tests.walks import WALKS, walked
 
 # They only get smaller, but for functions that say whose rows a node steps with (row streams), which solver a model has
 # here (in the digest), who looks after the process (a context for each call took longer than the call), whether a mesh
-# can start again, how an input changes within a step, on what outputs depend directly, and which values go from node to
-# node (a module of its own); and of an error, on which host it happened, and whether the run ends with it. The error
-# takes some functions more or fewer, as its processes hear of it in another order.
+# can start again, how an input changes within a step, on what outputs depend directly, which values go from node to
+# node (a module of its own), and in which sandbox a model is loaded; and of an error, on which host it happened, and
+# whether the run ends with it. The error takes some functions more or fewer, as its processes hear of it in another
+# order.
 MOST = {
-    "start value": (34, 96),
-    "SSP parameter": (42, 115),
+    "start value": (34, 97),
+    "SSP parameter": (42, 116),
     "error of a component": (29, 62),
 }
 
