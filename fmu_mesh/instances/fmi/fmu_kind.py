@@ -169,7 +169,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
 
     def summary(self, description: ModelDescription) -> str:
-        """The version of FMI; the solver, or for co-simulation the tolerance if one is set; whether it runs under Wine."""
+        """The version of FMI; the solver, or for co-simulation a tolerance that is set; whether it runs under Wine."""
         if description.kind == "co_simulation":
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
