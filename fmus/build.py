@@ -46,12 +46,17 @@ class BuildError(Exception):
 
 @dataclass(frozen=True)
 class Platform:
-    """What FMI 2.0, 2.3 and FMI 3.0, 2.5.1.4 call a platform, and how to link a shared library there."""
+    """What FMI 2.0, 2.3 and FMI 3.0, 2.5.1.4 call a platform, and how to link a shared library there.
+
+    Attributes:
+        compiler: what builds for it on another platform; empty: `find_compiler`.
+    """
 
     name: str
     name_in_fmi3: str
     suffix: str
     link_flags: tuple[str, ...]
+    compiler: tuple[str, ...] = ()
 
 
 LINUX = Platform(
@@ -59,14 +64,18 @@ LINUX = Platform(
 )
 MACOS = Platform("darwin64", "x86_64-darwin", ".dylib", ("-fPIC", "-dynamiclib", "-Wl,-x"))
 WINDOWS = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s", "-static-libgcc"))
+ZIG = (sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu", "-mcpu=baseline")
+WINDOWS_FROM_LINUX = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s"), ZIG)
+"""By the compiler that also builds the library of the mesh (`make library` installs it)."""
 
 
-def build(model_dir: Path, output_dir: Path) -> Path:
+def build(model_dir: Path, output_dir: Path, platform: Platform | None = None) -> Path:
     """Build the FMU of the model in ``model_dir``.
 
     Args:
         model_dir: the folder with ``modelDescription.xml`` and the model's C files.
         output_dir: where ``<modelIdentifier>.fmu`` goes; made if missing.
+        platform: of its library; without one, it is this platform, and the sources are in the FMU, too.
 
     Returns:
         The path of the FMU.
@@ -84,9 +93,9 @@ def build(model_dir: Path, output_dir: Path) -> Path:
     sources["fmu_guid.h"] = f'#define FMU_GUID "{guid}"\n'.encode()
     sources |= fmi_headers(version)
 
-    platform = this_platform()
+    members = {f"sources/{name}": content for name, content in sources.items()} if platform is None else {}
+    platform = platform or this_platform()
     library = compile_library(identifier, source_names, sources, platform)
-    members = {f"sources/{name}": content for name, content in sources.items()}
     members["modelDescription.xml"] = template.replace(GUID_PLACEHOLDER, guid).encode()
     platform_name = platform.name_in_fmi3 if version == "3" else platform.name
     members[f"binaries/{platform_name}/{identifier}{platform.suffix}"] = library
@@ -182,7 +191,7 @@ def compile_library(
     identifier: str, source_names: Sequence[str], sources: dict[str, bytes], platform: Platform
 ) -> bytes:
     """Compile the C files to a shared library and return its bytes."""
-    compiler = find_compiler()
+    compiler = platform.compiler or find_compiler()
     with tempfile.TemporaryDirectory(prefix="fmu_build_") as folder:
         for name, content in sources.items():
             Path(folder, name).write_bytes(content)
