@@ -56,6 +56,7 @@ typedef struct { /* the host of one FMU, for the node */
   int64_t shared_size;
   Twin *functions;
   int64_t n_functions;
+  const char *name; /* of the instance: the last message of a host says why it has ended */
   int64_t ended;
 } Host;
 

@@ -72,7 +72,7 @@ static void end_host(Host *host) {
              (unsigned long long)box->crash_address, box->text[0] ? " of " : "", box->text);
   else
     snprintf(text, sizeof text, "the process of the FMU under Wine has ended");
-  log_of_host(NULL, "", FATAL, "wine", text);
+  log_of_host(NULL, host->name, FATAL, "wine", text);
 }
 
 /* Let the host do what the mailbox says. Whether it is done; otherwise the host has ended. */
