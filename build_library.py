@@ -1,4 +1,4 @@
-"""Builds the library of C that steps a mesh, and puts it into the wheel.
+"""Builds the library of C that steps a mesh, and the program that runs FMUs for Windows; puts both into the wheel.
 
 The library for Linux on x86_64 is kept in the repository and in the source distribution, so that nobody needs a
 compiler. It is built by the C compiler of the Python package ziglang, in the version that `pyproject.toml` pins. So the
@@ -25,7 +25,7 @@ from typing import Any, Final
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import platform_tags
 
-__all__ = ["SOURCES", "TARGETS", "BuildError", "WheelHook", "build", "library_path", "manifest", "require_compiler"]
+__all__ = ["HOST", "SOURCES", "TARGETS", "BuildError", "WheelHook", "build", "library_path", "manifest", "require_compiler"]
 
 ROOT: Final = Path(__file__).resolve().parent
 PACKAGE: Final = ROOT / "fmu_mesh"
@@ -33,15 +33,34 @@ PACKAGE: Final = ROOT / "fmu_mesh"
 SOURCES: Final = (
     "rings/burst.c",
     "rings/streams.c",
+    "rings/hosted.c",
     "rings/model_exchange.c",
     "rings/burst.h",
     "rings/counters.h",
+    "rings/windows_host.h",
     "results/csv_rows.c",
     "instances/fmi/messages.c",
 )
 """The files of the library, below the package. A header stands here, too, so that its SHA-256 counts."""
 
-TARGETS: Final = {"linux-x86_64": "x86_64-linux-gnu.2.17", "linux-aarch64": "aarch64-linux-gnu.2.17"}
+HOST_SOURCES: Final = (
+    "rings/burst.c",
+    "rings/model_exchange.c",
+    "rings/windows_host.c",
+    "rings/burst.h",
+    "rings/counters.h",
+    "rings/windows_host.h",
+)
+"""The files of the program that runs an FMU for Windows under Wine."""
+
+HOST: Final = "windows-x86_64"
+"""The platform of this program."""
+
+TARGETS: Final = {
+    "linux-x86_64": "x86_64-linux-gnu.2.17",
+    "linux-aarch64": "aarch64-linux-gnu.2.17",
+    HOST: "x86_64-windows-gnu",
+}
 """What ziglang calls a platform. With glibc 2.17 the library runs on all Linux systems since 2014, except musl's."""
 
 WHEEL: Final = ("linux-x86_64", "manylinux_2_17_x86_64")
@@ -53,15 +72,12 @@ FLAGS: Final = (
     "-mcpu=baseline",  # not the processor of this machine
     "-ffp-contract=off",  # a fused multiply-add would make the floats depend on the processor
     "-fvisibility=hidden",
-    "-fPIC",
-    "-shared",
     "-s",  # no names of folders
-    "-Wl,--build-id=none",
-    "-Wl,--no-undefined",
     "-Wall",
     "-Wextra",
     "-Werror",
 )
+LIBRARY_FLAGS: Final = ("-fPIC", "-shared", "-Wl,--build-id=none", "-Wl,--no-undefined")
 
 
 class BuildError(Exception):
@@ -69,13 +85,19 @@ class BuildError(Exception):
 
 
 def library_path(platform: str) -> Path:
-    """Where the library for a platform lies."""
-    return PACKAGE / "rings" / f"burst-{platform}.so"
+    """Where the library for a platform lies, or the program for `HOST`."""
+    return PACKAGE / "rings" / f"burst-{platform}.{'exe' if platform == HOST else 'so'}"
 
 
-def manifest() -> str:
+def sources_of(platform: str) -> tuple[str, ...]:
+    """What is built for a platform."""
+    return HOST_SOURCES if platform == HOST else SOURCES
+
+
+def manifest(platform: str = WHEEL[0]) -> str:
     """The sources that the library contains: a line for each file, as `sha256sum` writes it."""
-    return "".join(f"{hashlib.sha256((PACKAGE / name).read_bytes()).hexdigest()}  {name}\n" for name in SOURCES)
+    digests = {name: hashlib.sha256((PACKAGE / name).read_bytes()).hexdigest() for name in sources_of(platform)}
+    return "".join(f"{digest}  {name}\n" for name, digest in digests.items())
 
 
 def require_compiler() -> None:
@@ -108,17 +130,19 @@ def build(platform: str) -> bytes:
     require_compiler()
     with tempfile.TemporaryDirectory(prefix="fmu_mesh_library_") as name:
         folder = Path(name)
-        for source in SOURCES:
+        for source in sources_of(platform):
             (folder / source).parent.mkdir(parents=True, exist_ok=True)
             (folder / source).write_bytes((PACKAGE / source).read_bytes())
-        lines = "".join(f'  "{line}\\n"\n' for line in manifest().splitlines())
-        visible = '__attribute__((visibility("default")))'
+        lines = "".join(f'  "{line}\\n"\n' for line in manifest(platform).splitlines())
+        visible = '__attribute__((visibility("default"), used))'
         (folder / "sources.c").write_text(f"{visible} const char fmu_mesh_sources[] =\n{lines};\n", encoding="utf-8")
-        code = [source for source in SOURCES if source.endswith(".c")]
-        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], *FLAGS, "-o", "library.so"]
+        code = [source for source in sources_of(platform) if source.endswith(".c")]
+        flags = FLAGS if platform == HOST else (*FLAGS, *LIBRARY_FLAGS)
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], *flags, "-o", "library.so"]
         command += [*code, "sources.c"]
         # Only these variables: some of the others, such as CPATH, change what a compiler does.
-        variables = {"HOME": name, "ZIG_GLOBAL_CACHE_DIR": f"{name}/global", "ZIG_LOCAL_CACHE_DIR": f"{name}/local"}
+        cache = os.environ.get("ZIG_GLOBAL_CACHE_DIR", f"{name}/global")  # a build for Windows takes a minute without it
+        variables = {"HOME": name, "ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": f"{name}/local"}
         done = subprocess.run(
             command, cwd=name, env=variables, capture_output=True, text=True, check=False, timeout=600
         )
@@ -142,37 +166,39 @@ class WheelHook(BuildHookInterface[Any]):
         platform, tag = WHEEL
         if version != "standard" or tag not in platform_tags():
             return
-        library = library_path(platform)
-        if not library.is_file() or manifest().encode() not in library.read_bytes():
-            raise BuildError(f"{library} is missing, or was built from other sources: make library")
-        build_data["force_include"][str(library)] = library.relative_to(ROOT).as_posix()
+        for built in (platform, HOST):
+            library = library_path(built)
+            if not library.is_file() or manifest(built).encode() not in library.read_bytes():
+                raise BuildError(f"{library} is missing, or was built from other sources: make library")
+            build_data["force_include"][str(library)] = library.relative_to(ROOT).as_posix()
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{tag}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build the library, or compare the one that is there."""
+    """Build the library and the program, or compare those that are there."""
     parser = argparse.ArgumentParser(description="Build the library of C that steps a mesh.")
     parser.add_argument(
-        "--platform", choices=TARGETS, default=WHEEL[0], help="what to build it for (default: %(default)s)"
+        "--platform", choices=TARGETS, help=f"what to build for (default: {WHEEL[0]}, and {HOST} for FMUs of Windows)"
     )
     parser.add_argument("--check", action="store_true", help="write nothing; fail if the library has other bytes")
     options = parser.parse_args(arguments)
-    path = library_path(options.platform)
-    try:
-        built = build(options.platform)
-    except BuildError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    if not options.check:
-        # A new file: a process that has loaded the old one keeps it.
-        draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-        draft.write_bytes(built)
-        draft.replace(path)
-    elif not path.is_file() or path.read_bytes() != built:
-        print(f"error: {path} is not what its sources give: make library", file=sys.stderr)
-        return 1
-    print(f"{path.relative_to(ROOT)} ({len(built)} bytes, SHA-256 {hashlib.sha256(built).hexdigest()})")
+    for platform in (options.platform,) if options.platform else (WHEEL[0], HOST):
+        path = library_path(platform)
+        try:
+            built = build(platform)
+        except BuildError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return 1
+        if not options.check:
+            # A new file: a process that has loaded the old one keeps it.
+            draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+            draft.write_bytes(built)
+            draft.replace(path)
+        elif not path.is_file() or path.read_bytes() != built:
+            print(f"error: {path} is not what its sources give: make library", file=sys.stderr)
+            return 1
+        print(f"{path.relative_to(ROOT)} ({len(built)} bytes, SHA-256 {hashlib.sha256(built).hexdigest()})")
     return 0
 
 

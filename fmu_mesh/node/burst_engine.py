@@ -231,6 +231,10 @@ class BurstEngine(Engine):
         )
         if own is not None:
             made.give(loads=own.loads, setters=own.setters, getters=own.getters, stores=own.stores)
+            if own.host is not None:
+                own.host.map(self._memory.path, self._memory.address, self._memory.map.size)
+                made.give(regions=own.regions)
+                made.note(host=own.host.address)
             if own.lines is not None:
                 made.note(lines=ctypes.addressof(own.lines), lines_count=len(own.lines))
         gates = [source.gate for source in sources]

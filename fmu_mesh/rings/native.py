@@ -13,11 +13,11 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_bool, c_char, c_double, c_int32, c_int64, c_void_p
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, Protocol, cast
 
 from ..variables.value_types import VariableType
 from .library import LibraryFunctions, load_library
@@ -39,10 +39,12 @@ __all__ = [
     "EquationsTable",
     "Gate",
     "HeardTable",
+    "HostTable",
     "IncomingTable",
     "Keep",
     "Last",
     "Lookup",
+    "MailboxTable",
     "MemberTable",
     "Move",
     "NativeStep",
@@ -52,16 +54,20 @@ __all__ = [
     "Participant",
     "Peer",
     "Piece",
+    "Region",
+    "Request",
     "RowBase",
     "Said",
     "Span",
     "Stage",
+    "StepHost",
     "StepKind",
     "StreamState",
     "StreamTable",
     "StreamsTable",
     "ToldTable",
     "Track",
+    "Twin",
     "UnitTable",
     "Wish",
     "WorkKind",
@@ -130,6 +136,12 @@ class WorkKind(IntEnum):
     STEP, CALL, READ, RESTORE, HAND_OVER = range(5)
 
 
+class Request(IntEnum):
+    """What a node asks of the host of an FMU for Windows."""
+
+    CALL_FUNCTION, LOAD, FIND, MAP, MAKE_CALLBACKS, COPY_TEXTS, TAKE_STEP, TAKE_BURST = range(8)
+
+
 _NUMBERS: Final = "Float64 Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean".split()  # noqa: SIM905  shorter
 NUMBER_TYPES: Final = cast(
     "dict[VariableType, int]", {name: number for number, name in enumerate(_NUMBERS)} | {"Enumeration": 8}
@@ -141,6 +153,7 @@ _KINDS: Final[dict[str, Any]] = {
     "int32_t": c_int32,
     "double": c_double,
     "uint8_t": c_bool,  # a truth of FMI 3.0
+    "char": c_char,
 }
 """The types of the fields; `declared` adds each structure."""
 
@@ -187,6 +200,21 @@ class Participant(Structure):
 @declared("Wish")
 class Wish(Structure):
     """One value of a counter that somebody waits for."""
+
+
+@declared("Region")
+class Region(Structure):
+    """Memory of this process that the host of an FMU needs."""
+
+
+@declared("Twin")
+class Twin(Structure):
+    """A function of an FMU: its address in this process, and in the host."""
+
+
+@declared("Mailbox")
+class MailboxTable(Changed):
+    """What a node and the host of an FMU share."""
 
 
 @declared("Gate")
@@ -268,6 +296,11 @@ class _WithArrays(Changed):
         for name, items in arrays.items():
             setattr(self, name, table(kinds[name]._type_, items))
             setattr(self, f"n_{name}", len(items))
+
+
+@declared("Host")
+class HostTable(_WithArrays):
+    """The host of an FMU for Windows."""
 
 
 @declared("Equations")
@@ -417,6 +450,19 @@ class WorkerTable(Structure):
     """A thread of copies."""
 
 
+class StepHost(Protocol):
+    """A process that runs the FMU of a step."""
+
+    @property
+    def address(self) -> int:
+        """Of its `HostTable`."""
+        ...
+
+    def map(self, path: Path | None, address: int, size: int) -> None:
+        """Let it map the memory of a run, which has this path and is at this address here; without a path it cannot."""
+        ...
+
+
 class NativeStep(NamedTuple):
     """How an FMU takes a step without Python: the tables of `call_step`.
 
@@ -427,6 +473,8 @@ class NativeStep(NamedTuple):
         getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
         kept: what the addresses point to.
+        host: runs the FMU; None: this process does.
+        regions: the memory that the addresses point to, for the host.
     """
 
     kind: StepKind
@@ -439,6 +487,8 @@ class NativeStep(NamedTuple):
     stores: Sequence[Move]
     kept: Sequence[object]
     lines: ctypes.Array[Any] | None = None
+    host: StepHost | None = None
+    regions: Sequence[Region] = ()
 
 
 def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure

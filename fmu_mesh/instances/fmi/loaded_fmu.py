@@ -24,6 +24,7 @@ from .calls import FmpyCalls, cffi_function, pointer
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
 from .step_options import Terms
+from .wine_library import WineLibrary
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 
@@ -97,7 +98,7 @@ class _Files:
             self.used_by.remove(model)
         if self.used_by:
             return
-        if self._loaded is not None and not self._stays and not process_ends():
+        if self._loaded is not None and (self._loaded.dll.host or (not self._stays and not process_ends())):
             with suppress(FMICallException, OSError):
                 self._loaded.freeLibrary()
         self._loaded = None
@@ -147,9 +148,13 @@ class LoadedFmu:
 
     def _load(self) -> Any:  # noqa: ANN401 FMPy is untyped
         functions, description = self._fmu.functions, self._fmu.description
-        path = self._folder / library_name(description.model_identifier, description.fmi_version)
+        path = self._folder / library_name(description.model_identifier, description.fmi_version, description.runs)
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
-            library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
+            library: FmuLibrary | WineLibrary
+            if description.runs == "wine":
+                library = WineLibrary(path, functions.library, self._fmu.name)
+            else:
+                library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
             return calling(functions.library)(
                 library=library,
                 environment=id(self),
