@@ -111,7 +111,8 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
             f"{what}; it has only '{known[0]}', the library of its other kind.",
             hint="Leave `kind` to the other one, or export it with both libraries.",
         )
-    windows = _library(path, names, identifiers, fmi_version, "wine")
+    runs_windows = fmpy.platform_tuple == "x86_64-linux"
+    windows = _library(path, names, identifiers, fmi_version, "wine") if runs_windows else None
     if windows is not None and wine_program() is not None:
         return windows
     if not identifier:
@@ -120,7 +121,7 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     ways = "Export it for this platform, or with its sources"
     if windows is not None:
         ways += f"; {INSTALL_WINE}"
-    elif {"win32", "x86-windows"} & set(platforms):
+    elif runs_windows and {"win32", "x86-windows"} & set(platforms):
         ways += ", or for 64-bit Windows, to run under Wine: libraries for 32-bit Windows are not supported yet"
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({wanted.split('/')[1]}); it has: "
