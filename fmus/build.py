@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["BuildError", "build", "find_compiler"]
+__all__ = ["WINDOWS_FROM_LINUX", "BuildError", "Platform", "build", "find_compiler", "this_platform"]
 
 HERE = Path(__file__).resolve().parent
 SKELETON = HERE / "src" / "skeleton"

@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-from fmus.build import Platform, find_compiler, this_platform
+from fmus.build import WINDOWS_FROM_LINUX, Platform, find_compiler, this_platform
 
 __all__ = ["MODELS", "build_event_fmu", "event_source_fmu"]
 
@@ -184,18 +184,16 @@ MODELS = {
 }
 
 
-def build_event_fmu(
-    name: str, version: Version, folder: Path, platform: Platform | None = None, **changes: str
-) -> Path:
+def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -> Path:
     """Build ``<name><version>.fmu`` into ``folder`` and return its path; one that is there already is used again.
 
     Args:
         name: a key of `MODELS`.
         version: of FMI; in 1.0 only model exchange is there.
         folder: made if missing.
-        platform: of its library; default: this one.
         changes: attributes of the co-simulation element that differ, such as ``canGetAndSetFMUstate="false"``; with
-            ``only="model_exchange"`` or ``"co_simulation"`` the other kind is not declared.
+            ``only="model_exchange"`` or ``"co_simulation"`` the other kind is not declared; with ``runs="windows"`` its
+            only library is for Windows.
     """
     model = MODELS[name]
     label = hashlib.sha256(repr(sorted(changes.items())).encode()).hexdigest()[:8] if changes else ""
@@ -204,8 +202,8 @@ def build_event_fmu(
         return built
     folder.mkdir(parents=True, exist_ok=True)
     guid = f"{{{hashlib.sha256(f'{name}{version}{label}'.encode()).hexdigest()[:32]}}}"
+    platform = WINDOWS_FROM_LINUX if changes.pop("runs", None) else this_platform()
     description = {1: _fmi1, 2: _fmi2, 3: _fmi3}[version](name, model, guid, changes)
-    platform = platform or this_platform()
     folder_name = platform.name_in_fmi3 if version == 3 else platform.name
     with zipfile.ZipFile(folder / f"{built.name}.{os.getpid()}.tmp", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("modelDescription.xml", description)

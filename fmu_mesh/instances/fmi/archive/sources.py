@@ -32,6 +32,7 @@ from ....archives.archive_entries import reading
 from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from ..step_options import Terms
+from ..wine import wine_environment
 from .archive import OpenFmu, in_new_folder, opened
 from .examining import examine, library_name, source_names
 from .library_names import rename_libraries
@@ -145,7 +146,8 @@ def _copied(path: Path, prepared: Path, parent: Path) -> Path:
 def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Callable[[str], None]) -> ModelDescription:
     """Read the model description of an FMU and get it ready to run, while its archive is open once.
 
-    If it has no library for this platform, its sources are compiled into the cache; ``tell`` is called before that.
+    If it has no library for this platform, its sources are compiled into the cache, or Wine is prepared; ``tell`` is
+    called before that.
     Its SHA-256 is known afterwards, so that `content_of` does not read it again. If its sources do not compile,
     `LoadFailed` has the first lines of the compiler.
     """
@@ -155,6 +157,8 @@ def describe(path: Path, terms: Terms, kind: Literal["auto"] | Kind, tell: Calla
         if model.library is None:
             with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, reading(path):
                 _fill(fmu, tell, model, Path(folder))
+        elif model.runs == "wine":
+            wine_environment(tell)
     return model
 
 
@@ -183,7 +187,7 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
         _add_library(fmu, folder, model, tell)
     elif model is not None:
         # A link with the name that FMI requires; other libraries of the FMU may refer to the original name.
-        named = folder / library_name(model.model_identifier, model.fmi_version)
+        named = folder / library_name(model.model_identifier, model.fmi_version, model.runs)
         if not named.exists():
             named.symlink_to(PurePosixPath(model.library or "").name)
 
