@@ -40,7 +40,7 @@ _PREPARE_S: Final = 300.0
 
 _OVERRIDES: Final = "mscoree,mshtml=d;winemenubuilder.exe=d"
 """No question about .NET (mono) and HTML (gecko), and nothing in the menus of a desktop."""
-_NO_SESSION: Final = ";wineboot.exe,services.exe,explorer.exe=d"
+_NO_SESSION: Final = ";services.exe,explorer.exe=d"
 """No services and no desktop: only the server and the program run, and it starts in a tenth of the time."""
 
 _DROPPED: Final = re.compile(r"WINE.*|DISPLAY|WAYLAND_DISPLAY|XDG_.*|DBUS_.*|LD_.*|LANG|LANGUAGE|LC_.*")
