@@ -22,7 +22,7 @@
 #include "counters.h"
 #include "windows_host.h"
 
-enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 100000, LOOK_MS = 100, LONG_STEPS = 16 };
+enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 10000, LOOK_MS = 100, LONG_STEPS = 16 };
 
 /* See messages.c. */
 void log_of_host(const void *address, const char *name, int status, const char *category, const char *text);
@@ -92,10 +92,8 @@ static int ask(Host *host, const Place *place, const Packed *packed) {
     (void)written;
   }
   for (int i = 0; atomic_load(&box->done) < number; i++) {
-    if (i < 100) {
+    if (i < 100 || now() < end) {
       relax();
-    } else if (now() < end) {
-      sched_yield();
     } else {
       atomic_store(&box->node_sleeps, 1);
       wake_owed(place);
