@@ -22,7 +22,7 @@
 #include "counters.h"
 #include "windows_host.h"
 
-enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 100000, LOOK_MS = 100, LONG_STEPS = 16 };
+enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 10000, LOOK_MS = 100, LONG_STEPS = 16 };
 
 /* See messages.c. */
 void log_of_host(const void *address, const char *name, int status, const char *category, const char *text);
@@ -31,7 +31,7 @@ typedef struct { /* what is copied for one request */
   Host *host;
   char *next;
   int is_lost; /* whether the host does not have some memory */
-  const Member *member; /* of this process, and its copy */
+  Member *member; /* of this process, and its copy */
   Member *copy;
   char **regions; /* the copies of its regions */
 } Packed;
@@ -53,12 +53,17 @@ static void wake_owed(const Place *place) {
     if (atomic_load(&place->bells[i].owed) && atomic_exchange(&place->bells[i].owed, 0)) wake_bell(&place->bells[i]);
 }
 
-/* What another thread may ask about while a request lasts: where the member is. */
+static void *back(const Host *host, const void *address) {
+  return host->mailbox + ((int64_t)address - mailbox_of(host)->there);
+}
+
+/* What others ask about while a request lasts: where the member is. */
 static void show(const Packed *packed) {
   if (packed == NULL) return;
-  Member *member = (Member *)(uintptr_t)packed->member;
+  Member *member = packed->member;
   member->step = packed->copy->step;
   member->stage = packed->copy->stage;
+  member->said->step = ((const Said *)back(packed->host, packed->copy->said))->step;
 }
 
 static void end_host(Host *host) {
@@ -87,15 +92,13 @@ static int ask(Host *host, const Place *place, const Packed *packed) {
     (void)written;
   }
   for (int i = 0; atomic_load(&box->done) < number; i++) {
-    if (i < 100) {
+    if (i < 100 || now() < end) {
       relax();
-    } else if (now() < end) {
-      sched_yield();
     } else {
       atomic_store(&box->node_sleeps, 1);
       wake_owed(place);
-      take_messages(host);
       show(packed);
+      take_messages(host);
       struct pollfd pipe = {.fd = (int)host->from, .events = POLLIN};
       if (atomic_load(&box->done) < number && poll(&pipe, 1, LOOK_MS) > 0 && read(pipe.fd, bytes, sizeof bytes) == 0 &&
           atomic_load(&box->done) < number) {
@@ -106,6 +109,7 @@ static int ask(Host *host, const Place *place, const Packed *packed) {
   }
   atomic_store(&box->node_sleeps, 0);
   wake_owed(place);
+  show(packed);
   take_messages(host);
   return !host->ended;
 }
@@ -190,7 +194,7 @@ static Call *put_calls(Packed *packed, const Call *calls, int64_t n) {
 }
 
 /* Copy a member, and what each step of it needs. */
-static void put_member(Packed *packed, Host *host, const Member *member) {
+static void put_member(Packed *packed, Host *host, Member *member) {
   *packed = (Packed){.host = host, .next = host->mailbox + ROOM, .member = member};
   Member *copy = packed->copy = put(packed, member, sizeof *member);
   packed->regions = put(packed, NULL, member->n_regions * (int64_t)sizeof(char *));
@@ -212,7 +216,7 @@ static void take_member(Packed *packed, Member *member) {
   const Member *copy = packed->copy;
   for (int64_t i = 0; i < member->n_regions; i++)
     memcpy(member->regions[i].address, packed->regions[i], (size_t)member->regions[i].size);
-  memcpy(member->said, packed->host->mailbox + ((char *)copy->said - (char *)mailbox_of(packed->host)->there), sizeof *member->said);
+  memcpy(member->said, back(packed->host, copy->said), sizeof *member->said);
   member->step = copy->step;
   member->stage = copy->stage;
   member->outcome = copy->outcome;
@@ -272,10 +276,6 @@ static void put_burst(Packed *packed, const Member *member) {
   copy->gates = there(packed, gates);
 }
 
-static void *back(const Packed *packed, const void *address) {
-  return packed->host->mailbox + ((const char *)address - (const char *)mailbox_of(packed->host)->there);
-}
-
 int hosted_advance(Node *node, Unit *unit, int64_t *ticks) {
   Packed packed;
   Member *member = unit->members;
@@ -302,9 +302,9 @@ int hosted_advance(Node *node, Unit *unit, int64_t *ticks) {
   const int64_t first = unit->tick;
   int result = (int)request(&packed, TAKE_BURST, node_copy, 0, &node->place);
   take_member(&packed, member);
-  const Gate *gates = back(&packed, packed.copy->gates);
+  const Gate *gates = back(host, packed.copy->gates);
   for (int64_t i = 0; i < member->n_gates; i++) member->gates[i].known = gates[i].known;
-  const Line *lines = back(&packed, packed.copy->lines);
+  const Line *lines = back(host, packed.copy->lines);
   for (int64_t i = 0; i < member->lines_count; i++) {
     double *const to = member->lines[i].to;
     member->lines[i] = lines[i];

@@ -18,7 +18,7 @@
 
 #include "windows_host.h"
 
-enum { LOOK_TICKS = 1000 /* of 100 ns */, MOST_ARGUMENTS = 15, MESSAGE_MS = 1000 };
+enum { LOOK_TICKS = 100 /* of 100 ns */, MOST_ARGUMENTS = 15, MESSAGE_MS = 1000 };
 
 int64_t take_step(Member *member, int64_t step);
 int64_t take_burst(Node *node, int64_t *ticks);
@@ -195,7 +195,7 @@ static void await_request(int64_t number) {
   DWORD got;
   QueryPerformanceCounter(&begin);
   while (atomic_load(&box->asked) < number) {
-    SwitchToThread();
+    __builtin_ia32_pause();
     QueryPerformanceCounter(&now);
     if (now.QuadPart - begin.QuadPart < LOOK_TICKS) continue;
     atomic_store(&box->host_sleeps, 1);

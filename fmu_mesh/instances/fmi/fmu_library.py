@@ -141,7 +141,9 @@ class _LoadedBefore:
 
     made_by: Callable[[], object]  # what FMPy has called last to make an instance
 
-    def __init__(self, library: FmuLibrary | WineLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
+    _loadFunctions: Callable[[], None]  # noqa: N815 FMPy's name
+
+    def __init__(self, library: Any, environment: int, **keywords: Any) -> None:  # noqa: ANN401 of either kind; FMPy's own
         self.dll = library
         self.environment = environment
         vars(self).update(keywords, fmiCallLogger=None, component=None, callbacks=None, _functions={})

@@ -241,8 +241,9 @@ class WineLibrary:
         """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
         is_set = "Set" in name
         if own.items is _TEXT:
-            here = (_TEXT * count).from_address(address)
-            given = [room.put((text or b"") + b"\0") if is_set else 0 for text in here]
+            here = (_PLACE * count).from_address(address)
+            texts = (_TEXT * count).from_address(address)
+            given = [room.put((text or b"") + b"\0") for text in texts] if is_set else [0] * count
             place = room.put(pack(f"<{count}q", *given))
 
             def copy() -> None:
