@@ -108,6 +108,7 @@ def _environment(prefix: Path, overrides: str) -> dict[str, str]:
         "WINEDEBUG": "-all",
         "WINEDLLOVERRIDES": overrides,
         "HOME": "/nonexistent",  # the folders of a user, such as Documents, would be those of the real one
+        "TMPDIR": str(prefix),  # for the socket of the server: all programs must find the same one
         "LC_ALL": "C.UTF-8",  # the names of files are UTF-8, and a number has a point
     }
 
