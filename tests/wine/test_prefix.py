@@ -98,9 +98,7 @@ def test_resources_have_a_uri_that_windows_code_understands() -> None:
 
 
 @NEEDS_WINE
-def test_a_cache_that_cannot_be_written_is_an_error_with_a_way_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cache_that_cannot_be_written_has_a_way_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("", encoding="ascii")
     monkeypatch.setenv("FMU_MESH_CACHE_DIR", str(tmp_path / "file"))
 
