@@ -4,9 +4,8 @@ Owns no memory but that of the tables; who makes a table keeps what its addresse
 library is missing: then the tables are only structures.
 """
 
-# Why not `cffi.FFI().cdef(header)`, which could read the header as well: its parser of C takes 40 to 60 ms at the start
-# of each process of a mesh, these expressions take less than one. That the header is the one of the library is known
-# by its SHA-256, which `library.py` compares, so the sizes of the structures need no look of their own.
+# Why not `cffi.FFI().cdef(header)`: its parser of C takes 40 to 60 ms at the start of each process of a mesh, these
+# expressions less than one. `library.py` compares the SHA-256 of the header, so the sizes need no look of their own.
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ from ctypes import POINTER, Structure, c_bool, c_char, c_double, c_int32, c_int6
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, cast
+from typing import Any, Final, NamedTuple, cast
 
 from ..variables.value_types import VariableType
 from .library import LibraryFunctions, load_library
@@ -39,12 +38,10 @@ __all__ = [
     "EquationsTable",
     "Gate",
     "HeardTable",
-    "HostTable",
     "IncomingTable",
     "Keep",
     "Last",
     "Lookup",
-    "MailboxTable",
     "MemberTable",
     "Move",
     "NativeStep",
@@ -55,24 +52,19 @@ __all__ = [
     "Peer",
     "Piece",
     "Region",
-    "Request",
     "RowBase",
     "Said",
     "Span",
     "Stage",
-    "StepHost",
     "StepKind",
     "StreamState",
     "StreamTable",
     "StreamsTable",
     "ToldTable",
     "Track",
-    "Twin",
     "UnitTable",
     "Wish",
     "WorkKind",
-    "WorkTable",
-    "WorkerTable",
     "declared",
     "library",
     "table",
@@ -134,12 +126,6 @@ class WorkKind(IntEnum):
     """What is done with many copies."""
 
     STEP, CALL, READ, RESTORE, HAND_OVER = range(5)
-
-
-class Request(IntEnum):
-    """What a node asks of the host of an FMU for Windows."""
-
-    CALL_FUNCTION, LOAD, FIND, MAP, MAKE_CALLBACKS, COPY_TEXTS, TAKE_STEP, TAKE_BURST = range(8)
 
 
 _NUMBERS: Final = "Float64 Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 Boolean".split()  # noqa: SIM905  shorter
@@ -205,16 +191,6 @@ class Wish(Structure):
 @declared("Region")
 class Region(Structure):
     """Memory of this process that the host of an FMU needs."""
-
-
-@declared("Twin")
-class Twin(Structure):
-    """A function of an FMU: its address in this process, and in the host."""
-
-
-@declared("Mailbox")
-class MailboxTable(Changed):
-    """What a node and the host of an FMU share."""
 
 
 @declared("Gate")
@@ -296,11 +272,6 @@ class _WithArrays(Changed):
         for name, items in arrays.items():
             setattr(self, name, table(kinds[name]._type_, items))
             setattr(self, f"n_{name}", len(items))
-
-
-@declared("Host")
-class HostTable(_WithArrays):
-    """The host of an FMU for Windows."""
 
 
 @declared("Equations")
@@ -440,29 +411,6 @@ class CopyOutput(Structure):
     """Where the rows of one copy have an output."""
 
 
-@declared("Work")
-class WorkTable(Changed):
-    """What is done with many copies."""
-
-
-@declared("Worker")
-class WorkerTable(Structure):
-    """A thread of copies."""
-
-
-class StepHost(Protocol):
-    """A process that runs the FMU of a step."""
-
-    @property
-    def address(self) -> int:
-        """Of its `HostTable`."""
-        ...
-
-    def map(self, path: Path | None, address: int, size: int) -> None:
-        """Let it map the memory of a run, which has this path and is at this address here; without a path it cannot."""
-        ...
-
-
 class NativeStep(NamedTuple):
     """How an FMU takes a step without Python: the tables of `call_step`.
 
@@ -473,8 +421,9 @@ class NativeStep(NamedTuple):
         getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
         kept: what the addresses point to.
-        host: runs the FMU; None: this process does.
+        host: the `Host` that runs the FMU; 0: this process does.
         regions: the memory that the addresses point to, for the host.
+        share: lets the host map memory of a run, with its path, and its address and size here.
     """
 
     kind: StepKind
@@ -487,8 +436,9 @@ class NativeStep(NamedTuple):
     stores: Sequence[Move]
     kept: Sequence[object]
     lines: ctypes.Array[Any] | None = None
-    host: StepHost | None = None
+    host: int = 0
     regions: Sequence[Region] = ()
+    share: Callable[[Path | None, int, int], None] | None = None
 
 
 def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure

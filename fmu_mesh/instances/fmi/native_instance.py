@@ -236,7 +236,7 @@ class NativeInstance(FmuInstance):
             own.append(Region(address_of(part.arguments[0]), 4 * len(part.variables)))
             if isinstance(part.buffer, NumberBuffer):
                 own.append(Region(part.buffer.address, part.buffer.size))
-        return tables._replace(host=host, regions=own)
+        return tables._replace(host=host.address, regions=own, share=host.map)
 
     def _table(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
@@ -246,6 +246,7 @@ class NativeInstance(FmuInstance):
             component=tables.component,
             do_step=tables.do_step,
             said=tables.said,
+            host=tables.host,
             start_time=self._start_time,
             base_step_size=self._base_step_size,
             step_size=self._step_size,
@@ -254,9 +255,7 @@ class NativeInstance(FmuInstance):
             bases=(ctypes.c_void_p * native.RowBase.FIRST_GATE)(),
         )
         member.give(loads=tables.loads, setters=tables.setters, getters=tables.getters, stores=tables.stores)
-        if tables.host is not None:
-            member.give(regions=tables.regions)
-            member.note(host=tables.host.address)
+        member.give(regions=tables.regions)
         return member
 
     def _fail_to_set(self, step: int, status: int) -> None:

@@ -19,6 +19,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from enum import IntEnum
 from pathlib import Path
 from struct import pack, unpack
 from types import UnionType
@@ -29,12 +30,12 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 
 from ...rings import native
 from ...rings.library import host_program
-from ...rings.native import HostTable, MailboxTable, Request, Twin
+from ...rings.native import Changed, declared, table
 from .fmu_library import absent
 from .fmu_values import FATAL
 from .wine import windows_path, wine_environment, wine_program
 
-__all__ = ["WineLibrary"]
+__all__ = ["Request", "WineLibrary"]
 
 _SIZE: Final = 1 << 30
 """Of the memory, in bytes; what is not used takes no space."""
@@ -46,6 +47,29 @@ _WITH_US: Final = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.exe
 """A program of Python that becomes another one, which the kernel kills with the thread that has started it."""
 _TEXT: Final = ctypes.c_char_p
 _PLACE: Final = ctypes.c_void_p
+_POINTER: Final[Any] = ctypes.POINTER(ctypes.c_int).__base__
+_FUNCTION: Final[Any] = ctypes.CFUNCTYPE(None).__base__
+
+
+class Request(IntEnum):
+    """What a node asks of a host, as `burst.h` has it."""
+
+    CALL_FUNCTION, LOAD, FIND, MAP, MAKE_CALLBACKS, COPY_TEXTS, TAKE_STEP, TAKE_BURST = range(8)
+
+
+@declared("Twin")
+class Twin(ctypes.Structure):
+    """A function of an FMU: its address in this process, and in the host."""
+
+
+@declared("Mailbox")
+class MailboxTable(Changed):
+    """What a node and a host share."""
+
+
+@declared("Host")
+class HostTable(Changed):
+    """A host."""
 
 
 class _Argument(NamedTuple):
@@ -60,13 +84,13 @@ class _Argument(NamedTuple):
         """As FMPy has it."""
         own = known.annotation
         type_ = get_args(own)[0] if isinstance(own, UnionType) else own
-        is_pointer = issubclass(type_, ctypes._Pointer)  # noqa: SLF001 there is no other name for all pointers
+        is_pointer = issubclass(type_, _POINTER)
         return cls(known.name, type_, type_._type_ if is_pointer else None)
 
     @property
     def passed(self) -> Any:  # noqa: ANN401 as above
         """The type of ctypes that our functions get it in."""
-        is_address = self.items is not None or issubclass(self.type, ctypes._CFuncPtr)  # type: ignore[attr-defined]  # noqa: SLF001 as above
+        is_address = self.items is not None or issubclass(self.type, _FUNCTION)
         return _PLACE if is_address else self.type
 
 
@@ -134,11 +158,11 @@ class WineLibrary:
 
     @property
     def address(self) -> int:
-        """See `StepHost`."""
+        """Of the table of the host."""
         return ctypes.addressof(self._table)
 
     def map(self, path: Path | None, address: int, size: int) -> None:
-        """See `StepHost`."""
+        """See `NativeStep.share`; memory without a path is private."""
         if path is None or address == self._table.shared:
             return
         if there := self._ask(Request.MAP, self._named(windows_path(path))):
@@ -149,7 +173,8 @@ class WineLibrary:
         process = self._process
         if process is None:
             return
-        self._process, self._table.ended = None, 1
+        self._process = None
+        self._table.note(ended=1)
         for pipe in (process.stdin, process.stdout):
             if pipe is not None:
                 pipe.close()
@@ -205,7 +230,8 @@ class WineLibrary:
 
         function: Any = ctypes.CFUNCTYPE(result, *(argument.passed for argument in arguments))(call)
         self._twins.append(Twin(ctypes.cast(function, _PLACE), there))
-        self._table.give(functions=self._twins)
+        self._functions = table(Twin, self._twins)
+        self._table.note(functions=self._functions, n_functions=len(self._twins))
         return function
 
     def _call(self, name: str, there: int, arguments: Sequence[_Argument], values: Sequence[Any]) -> int:
@@ -272,7 +298,7 @@ class WineLibrary:
     def _ask(self, what: Request, *arguments: int) -> int:
         """Let the host answer a request; 0 if it has ended."""
         box = self._box
-        box.what = what
+        box.note(what=what)
         box.arguments[: len(arguments)] = arguments
         assert native.library is not None
         return int(box.result) if native.library.host_ask(self.address) else 0
