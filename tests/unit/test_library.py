@@ -21,6 +21,7 @@ from hatchling.builders.wheel import WheelBuilder
 import build_library
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.fmi.model_exchange.dormand_prince import Solved
+from fmu_mesh.instances.fmi.wine_library import Request
 from fmu_mesh.rings import native
 from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, library_missed, load_library, why_no_library
 from tests.helpers import write_config
@@ -230,7 +231,7 @@ def test_library_of_older_sources_is_error_that_says_how_to_build_it(clone: Path
 
 
 @pytest.mark.parametrize(
-    "known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd, Solved]
+    "known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd, Solved, Request]
 )
 def test_an_enumeration_has_the_names_of_the_header_in_their_order(known: type[IntEnum]) -> None:
     header = (LIBRARY.parent / "burst.h").read_text()
