@@ -96,9 +96,7 @@ def library_folders(fmi_version: str, runs: Runs = "native") -> tuple[str, ...]:
     return (fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform,)
 
 
-def library_name(
-    identifier: str, fmi_version: str, names: Iterable[str | None] = (), runs: Runs = "native"
-) -> str:
+def library_name(identifier: str, fmi_version: str, names: Iterable[str | None] = (), runs: Runs = "native") -> str:
     """The path of the library for a platform inside an FMU, in the first folder for it that ``names`` has."""
     there = {name.rpartition("/")[0] for name in names if name is not None}
     folders = [f"binaries/{folder}" for folder in library_folders(fmi_version, runs)]
