@@ -67,7 +67,9 @@ needs_the_compiler = pytest.mark.skipif(not built_by_the_pinned_compiler(), reas
 
 @pytest.mark.parametrize("platform", build_library.TARGETS)
 def test_the_library_in_the_tree_was_built_from_the_sources_in_tree(platform: str) -> None:
-    assert build_library.manifest().encode() in build_library.library_path(platform).read_bytes(), "make library"
+    assert build_library.manifest(platform).encode() in build_library.library_path(platform).read_bytes(), (
+        "make library"
+    )
 
 
 @needs_the_compiler
