@@ -347,6 +347,7 @@ NOT_RUN = [
         "fmu-mesh render kubernetes configs/pendulum_delay.yaml --security lab --claim lab-data -o mesh.yaml",
         "it needs a cluster",
     ),
+    ("docs/fmi-support-protection.md", "process: {sandbox: wasm}", "it needs an FMU of your own"),
     (
         "docs/foxglove.md",
         "ssh -L 8765:127.0.0.1:8765 robot fmu-mesh foxglove",
