@@ -117,7 +117,8 @@ def test_edges_and_a_table_show_defects_in_both_themes(place: Place) -> None:
         run = place.start("launch", config, "--no-progress")
         wait_until(lambda: page.state == "running", "the mesh on the page")
         wait_until(lambda: "\nassumed and came differ by at most " in page.run(_TIP), "the defect of the edge")
-        assert "Largest defects: a pointer to the connection, no error estimate" in page.text
+        title = "Largest defects: a pointer to the connection, no error estimate"
+        wait_until(lambda: title in page.text, "the table of defects")
         assert page.run(_RINGS) == 1
         shown = _status(place, "pair")["defects"]["pendulum.a -> delay.x"]
         assert 0.0 < shown["rms"] < shown["maximum"]

@@ -84,7 +84,7 @@ def test_a_node_says_what_it_waits_for_and_so_does_the_error(place: Place) -> No
     told = [line for line in launched.errors.splitlines() if "it has waited" in line]
     assert "for 'pendulum.a', which feeds 'delay.x'" in told[0]
     assert "node 'pendulum'" in told[-1]
-    assert "no progress for 1." in told[-1]
+    assert "no progress for " in told[-1]
     assert "delay at point" in told[-1]
     place.assert_nothing_left(within_s=5.0)
 
