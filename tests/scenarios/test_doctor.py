@@ -67,6 +67,7 @@ def doctor(*prefix: str) -> tuple[int, dict[str, HostCheck]]:
             "Install one, name it in $CC, or export the",
         ),
         ("C++ compiler", "there is no compiler (looked for c++, g++, clang++)", "Install one, name it in $CXX, or"),
+        ("wine", "FMUs that have only Windows binaries need the program wine", "on Debian with `apt install wine64`."),
         ("Gazebo classic", "does not run on this host: there is no 'gazebo_lockstep'", "Build bridges/gazebo_classic"),
         ("Sandbox", "bubblewrap, which is not installed", "Use `apt-get install bubblewrap`, or `sandbox: none`."),
         ("ssh", "nodes on other hosts need the program ssh", "on Debian with `apt install openssh-client`."),
@@ -195,7 +196,7 @@ def test_a_kind_whose_package_is_broken_hides_no_other(tmp_path: Path, monkeypat
 
     code, found = doctor()
 
-    assert (code, found["Kind 'table'"].state, found["ssh"].state) == (0, "missing", "missing")
+    assert (code, found["Kind 'table'"].state, found["wine"].state) == (0, "missing", "missing")
     assert (
         "'table' of the package 'tables' cannot be imported from 'no_such_module:Table'" in found["Kind 'table'"].found
     )
