@@ -1,4 +1,4 @@
-"""Builds the library of C that steps a mesh, and puts it into the wheel.
+"""Builds the library of C that steps a mesh, and the program that runs FMUs for Windows; puts both into the wheel.
 
 The libraries for Linux on x86_64 and on aarch64 are kept in the repository and in the source distribution, so that
 nobody needs a compiler. They are built by the C compiler of the Python package ziglang, in the version that
@@ -25,7 +25,17 @@ from typing import Any, Final
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from packaging.tags import platform_tags
 
-__all__ = ["SOURCES", "TARGETS", "BuildError", "WheelHook", "build", "library_path", "manifest", "require_compiler"]
+__all__ = [
+    "HOST",
+    "SOURCES",
+    "TARGETS",
+    "BuildError",
+    "WheelHook",
+    "build",
+    "library_path",
+    "manifest",
+    "require_compiler",
+]
 
 ROOT: Final = Path(__file__).resolve().parent
 PACKAGE: Final = ROOT / "fmu_mesh"
@@ -33,15 +43,34 @@ PACKAGE: Final = ROOT / "fmu_mesh"
 SOURCES: Final = (
     "rings/burst.c",
     "rings/streams.c",
+    "rings/hosted.c",
     "rings/model_exchange.c",
     "rings/burst.h",
     "rings/counters.h",
+    "rings/windows_host.h",
     "results/csv_rows.c",
     "instances/fmi/messages.c",
 )
 """The files of the library, below the package. A header stands here, too, so that its SHA-256 counts."""
 
-TARGETS: Final = {"linux-x86_64": "x86_64-linux-gnu.2.17", "linux-aarch64": "aarch64-linux-gnu.2.17"}
+HOST_SOURCES: Final = (
+    "rings/burst.c",
+    "rings/model_exchange.c",
+    "rings/windows_host.c",
+    "rings/burst.h",
+    "rings/counters.h",
+    "rings/windows_host.h",
+)
+"""The files of the program that runs an FMU for Windows under Wine."""
+
+HOST: Final = "windows-x86_64"
+"""The platform of this program."""
+
+TARGETS: Final = {
+    "linux-x86_64": "x86_64-linux-gnu.2.17",
+    "linux-aarch64": "aarch64-linux-gnu.2.17",
+    HOST: "x86_64-windows-gnu",
+}
 """What ziglang calls a platform. With glibc 2.17 the library runs on all Linux systems since 2014, except musl's."""
 
 WHEELS: Final = {"linux-x86_64": "manylinux_2_17_x86_64", "linux-aarch64": "manylinux_2_17_aarch64"}
@@ -53,16 +82,13 @@ FLAGS: Final = (
     "-mcpu=baseline",  # not the processor of this machine
     "-ffp-contract=off",  # a fused multiply-add would make the floats depend on the processor
     "-fvisibility=hidden",
-    "-fPIC",
-    "-shared",
     "-s",  # no names of folders
-    "-Wl,--build-id=none",
-    "-Wl,--no-undefined",
     "-Wall",
     "-Wextra",
     "-Watomic-implicit-seq-cst",  # an access of an atomic names its memory order
     "-Werror",
 )
+LIBRARY_FLAGS: Final = ("-fPIC", "-shared", "-Wl,--build-id=none", "-Wl,--no-undefined")
 
 
 class BuildError(Exception):
@@ -70,13 +96,19 @@ class BuildError(Exception):
 
 
 def library_path(platform: str) -> Path:
-    """Where the library for a platform lies."""
-    return PACKAGE / "rings" / f"burst-{platform}.so"
+    """Where the library for a platform lies, or the program for `HOST`."""
+    return PACKAGE / "rings" / f"burst-{platform}.{'exe' if platform == HOST else 'so'}"
 
 
-def manifest() -> str:
+def sources_of(platform: str) -> tuple[str, ...]:
+    """What is built for a platform."""
+    return HOST_SOURCES if platform == HOST else SOURCES
+
+
+def manifest(platform: str = "linux-x86_64") -> str:
     """The sources that the library contains: a line for each file, as `sha256sum` writes it."""
-    return "".join(f"{hashlib.sha256((PACKAGE / name).read_bytes()).hexdigest()}  {name}\n" for name in SOURCES)
+    digests = {name: hashlib.sha256((PACKAGE / name).read_bytes()).hexdigest() for name in sources_of(platform)}
+    return "".join(f"{digest}  {name}\n" for name, digest in digests.items())
 
 
 def require_compiler() -> None:
@@ -109,17 +141,20 @@ def build(platform: str) -> bytes:
     require_compiler()
     with tempfile.TemporaryDirectory(prefix="fmu_mesh_library_") as name:
         folder = Path(name)
-        for source in SOURCES:
+        for source in sources_of(platform):
             (folder / source).parent.mkdir(parents=True, exist_ok=True)
             (folder / source).write_bytes((PACKAGE / source).read_bytes())
-        lines = "".join(f'  "{line}\\n"\n' for line in manifest().splitlines())
-        visible = '__attribute__((visibility("default")))'
+        lines = "".join(f'  "{line}\\n"\n' for line in manifest(platform).splitlines())
+        visible = '__attribute__((visibility("default"), used))'
         (folder / "sources.c").write_text(f"{visible} const char fmu_mesh_sources[] =\n{lines};\n", encoding="utf-8")
-        code = [source for source in SOURCES if source.endswith(".c")]
-        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], *FLAGS, "-o", "library.so"]
+        code = [source for source in sources_of(platform) if source.endswith(".c")]
+        flags = FLAGS if platform == HOST else (*FLAGS, *LIBRARY_FLAGS)
+        command = [sys.executable, "-m", "ziglang", "cc", "-target", TARGETS[platform], *flags, "-o", "library.so"]
         command += [*code, "sources.c"]
         # Only these variables: some of the others, such as CPATH, change what a compiler does.
-        variables = {"HOME": name, "ZIG_GLOBAL_CACHE_DIR": f"{name}/global", "ZIG_LOCAL_CACHE_DIR": f"{name}/local"}
+        # With a cache of the compiler, a build for Windows takes a second and not a minute.
+        cache = os.environ.get("ZIG_GLOBAL_CACHE_DIR", f"{name}/global")
+        variables = {"HOME": name, "ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": f"{name}/local"}
         done = subprocess.run(
             command, cwd=name, env=variables, capture_output=True, text=True, check=False, timeout=600
         )
@@ -144,18 +179,19 @@ class WheelHook(BuildHookInterface[Any]):
         platform = next((name for name, tag in WHEELS.items() if tag in tags), None)
         if version != "standard" or platform is None:
             return
-        library = library_path(platform)
-        if not library.is_file() or manifest().encode() not in library.read_bytes():
-            raise BuildError(f"{library} is missing, or was built from other sources: make library")
-        build_data["force_include"][str(library)] = library.relative_to(ROOT).as_posix()
+        for built in (platform, *([HOST] if platform == "linux-x86_64" else ())):
+            library = library_path(built)
+            if not library.is_file() or manifest(built).encode() not in library.read_bytes():
+                raise BuildError(f"{library} is missing, or was built from other sources: make library")
+            build_data["force_include"][str(library)] = library.relative_to(ROOT).as_posix()
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{WHEELS[platform]}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Build the libraries, or compare those that are there."""
+    """Build the libraries and the program, or compare those that are there."""
     parser = argparse.ArgumentParser(description="Build the library of C that steps a mesh.")
-    parser.add_argument("--platform", choices=TARGETS, help="what to build it for (default: all)")
+    parser.add_argument("--platform", choices=TARGETS, help="what to build for (default: all)")
     parser.add_argument("--check", action="store_true", help="write nothing; fail if a library has other bytes")
     options = parser.parse_args(arguments)
     for platform in [options.platform] if options.platform else TARGETS:

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-__all__ = ["BuildError", "build", "find_compiler"]
+__all__ = ["WINDOWS_FROM_LINUX", "BuildError", "Platform", "build", "find_compiler", "this_platform"]
 
 HERE = Path(__file__).resolve().parent
 SKELETON = HERE / "src" / "skeleton"
@@ -69,6 +69,9 @@ ARM_FROM_X86 = replace(
 """By the compiler that also builds the library of the mesh (`make library` installs it)."""
 MACOS = Platform("darwin64", "x86_64-darwin", ".dylib", ("-fPIC", "-dynamiclib", "-Wl,-x"))
 WINDOWS = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s", "-static-libgcc"))
+ZIG = (sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu", "-mcpu=baseline")
+WINDOWS_FROM_LINUX = Platform("win64", "x86_64-windows", ".dll", ("-shared", "-s"), ZIG)
+"""By the compiler that also builds the library of the mesh (`make library` installs it)."""
 
 
 def build(model_dir: Path, output_dir: Path, platform: Platform | None = None) -> Path:

@@ -209,7 +209,9 @@ class BurstEngine(Engine):
         grid, points = runner.grid, runner.plan.step_points
         watched = runner.watched if runner.watched is not None else runner.outputs
         rings = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in (runner.outputs, watched)]
-        names = ("kind", "component", "do_step", "said") if own is not None else ()  # without them, BY_PYTHON is 0
+        names = (
+            ("kind", "component", "do_step", "said", "host") if own is not None else ()
+        )  # without them, BY_PYTHON is 0
         calls = {name: getattr(own, name) for name in names}
         by_python = self._step_of(runner)
         made = native.MemberTable(
@@ -232,6 +234,9 @@ class BurstEngine(Engine):
         )
         if own is not None:
             made.give(loads=own.loads, setters=own.setters, getters=own.getters, stores=own.stores)
+            made.give(regions=own.regions)
+            if own.share is not None:
+                own.share(self._memory.path, self._memory.address, self._memory.map.size)
             if own.lines is not None:
                 made.note(lines=ctypes.addressof(own.lines), lines_count=len(own.lines))
         gates = [source.gate for source in sources]

@@ -52,7 +52,6 @@
  */
 #define _GNU_SOURCE
 #include <fenv.h>
-#include <sched.h>
 #include <stddef.h>
 #include <string.h>
 
@@ -338,6 +337,7 @@ static inline int64_t call_step(Member *member, int64_t step) {
   if ((status = move_all(member->loads, member->n_loads, bases)) != 0)
     return (int64_t)SETTING << STAGE_BITS | status;
   if (!(said->quiet_until > end)) return (int64_t)IN_PYTHON << STAGE_BITS;
+  if (member->host != NULL) return hosted_step(member, step);
   if ((status = call_all(member, member->setters, member->n_setters)) != 0)
     return (int64_t)SETTING << STAGE_BITS | (status & 0xffffff);
   member->stage = STEPPING;
@@ -643,6 +643,11 @@ out:
   return result;
 }
 
+/* For the host of an FMU under Wine: there, the member is like any other. */
+int64_t take_step(Member *member, int64_t step) { return call_step(member, step); }
+
+int64_t take_burst(Node *node, int64_t *ticks) { return advance(node, node->units, ticks); }
+
 /* What a unit sleeps for. Of a grant and a row that it lacks, the row comes later, because its source steps with the grant,
  * too: who slept for the grant would wake twice for each point of a run that the wall clock paces. */
 static inline Wish wish_of(const Node *node, const Unit *unit) {
@@ -692,7 +697,8 @@ PUBLIC int64_t node_run(Node *node) {
       Unit *unit = &node->units[i];
       if (unit->stopped || unit->tick >= unit->last_tick) continue;
       int64_t ticks = 0;
-      int result = advance(node, unit, &ticks);
+      int result = unit->n_members == 1 && unit->members->host != NULL ? hosted_advance(node, unit, &ticks) : NOT_HOSTED;
+      if (result == NOT_HOSTED) result = advance(node, unit, &ticks);
       int64_t end = now(), elapsed = end - begin;
       begin = end;
       if (ticks > 0) {

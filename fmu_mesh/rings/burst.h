@@ -22,6 +22,46 @@ typedef struct { /* one value that somebody waits for */
   int64_t need;
 } Wish;
 
+/* ---- an FMU for Windows, which runs under Wine: see hosted.c */
+
+typedef struct { /* memory of this process that the tables name by addresses, and that the host needs, too */
+  char *address;
+  int64_t size;
+} Region;
+
+typedef struct { /* a function of the FMU: what stands in the tables of this process, and where the host has it */
+  void *here, *there;
+} Twin;
+
+typedef struct { /* the first bytes of the memory that a node and the host share; then come messages, and then room */
+  _Atomic int64_t asked; /* requests; only the node writes it */
+  int64_t beside_asked[7];
+  _Atomic int64_t done; /* how many of them are done; only the host writes it */
+  int64_t beside_done[7];
+  _Atomic int64_t host_sleeps, node_sleeps; /* until a byte comes through its pipe */
+  _Atomic int64_t told, taken;              /* messages of the FMU: written by the host, and read by the node */
+  int64_t what, result;                     /* of the request */
+  int64_t arguments[16];
+  int64_t there;                     /* where the host has this memory */
+  int64_t log_fmi3, callbacks_fmi1;  /* addresses in the host that an FMU gets */
+  int64_t crash, crash_address;      /* the exception of Windows that has ended the host */
+  char text[512];                    /* what is wrong, or in which module the crash was */
+} Mailbox;
+
+typedef struct { /* the host of one FMU, for the node */
+  char *mailbox;
+  int64_t size;     /* of the memory that begins with it */
+  int64_t to, from; /* the ends of the pipes */
+  char *shared, *shared_there; /* the memory of the run, if the host has it, too */
+  int64_t shared_size;
+  Twin *functions;
+  int64_t n_functions;
+  const char *name; /* of the instance: the last message of a host says why it has ended */
+  int64_t ended;
+} Host;
+
+enum Request { CALL_FUNCTION, LOAD, FIND, MAP, MAKE_CALLBACKS, COPY_TEXTS, TAKE_STEP, TAKE_BURST }; /* Mailbox.what */
+
 /* ---- one instance */
 
 enum StepKind { BY_PYTHON, FMI1, FMI2, FMI3, EQUATIONS };                  /* Member.kind */
@@ -130,6 +170,9 @@ typedef struct { /* one instance: how it gets its inputs, steps, and gives its o
   int64_t step, stage;
   int64_t outcome;   /* stage and status of a call that Python has to look at */
   void *by_python;   /* an object of Python, which is called with the number of an own step that Python takes */
+  Host *host;        /* of an FMU for Windows; otherwise NULL */
+  Region *regions;
+  int64_t n_regions;
 } Member;
 
 /* ---- model exchange: see model_exchange.c */

@@ -3,16 +3,19 @@
 #ifndef FMU_MESH_COUNTERS_H
 #define FMU_MESH_COUNTERS_H
 
+#include <stdatomic.h>
+#include <stdint.h>
+#ifndef _WIN32
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
 #include <linux/futex.h>
-#include <stdatomic.h>
-#include <stdint.h>
+#include <sched.h>
 #include <stdio.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
+#endif
 
 #include "burst.h"
 
@@ -31,31 +34,34 @@ struct Bell {
   _Atomic uint32_t rung;
   _Atomic uint32_t polls;         /* its process waits for file descriptors, too: then it is rung by a pipe */
   _Atomic int32_t process, pipe;  /* the pipe: who has it, and the descriptor there */
-  uint32_t unused[12];
+  _Atomic uint32_t owed; /* a host under Wine has rung it, and cannot wake: its node does that */
+  uint32_t unused[11];
 };
 
 /* ---- waiting */
 
+#ifdef _WIN32 /* the host of an FMU under Wine: it has no futex, and windows.h has names of ours */
+int SwitchToThread(void);
+int QueryPerformanceCounter(int64_t *);
+void nudge(void); /* let the node of this host look */
+
+static inline int64_t now(void) {
+  int64_t ticks;
+  QueryPerformanceCounter(&ticks);
+  return 100 * ticks; /* Wine's have 100 ns */
+}
+
+static inline int sched_yield(void) { return SwitchToThread(); }
+
+static inline void wake_bell(Bell *bell) {
+  atomic_store_explicit(&bell->owed, 1, memory_order_release); /* after `rung` */
+  nudge();
+}
+#else
 static inline int64_t now(void) {
   struct timespec time;
   clock_gettime(CLOCK_MONOTONIC, &time);
   return (int64_t)time.tv_sec * 1000000000 + time.tv_nsec;
-}
-
-static inline void relax(void) {
-#if defined(__x86_64__)
-  __builtin_ia32_pause();
-#elif defined(__aarch64__)
-  __asm__ volatile("yield");
-#endif
-}
-
-/* All seq_cst: `needs` was stored before, and a writer that finds `wake_at` lowered has to find it. */
-static inline void lower(_Atomic int64_t *place, int64_t value) {
-  int64_t seen = atomic_load_explicit(place, memory_order_seq_cst);
-  while (value < seen &&
-         !atomic_compare_exchange_weak_explicit(place, &seen, value, memory_order_seq_cst, memory_order_seq_cst))
-    continue;
 }
 
 /* Of another process, the end of the pipe to write to is opened as its memory was: through /proc. */
@@ -75,13 +81,34 @@ static inline void ring_pipe(const Bell *bell) {
   if (fd != pipe) close(fd);
 }
 
-static inline void ring(Bell *bell) {
-  /* seq_cst: of this and `poll_streams`, which stores `polls` and then looks at the bell, one sees the other */
-  atomic_fetch_add_explicit(&bell->rung, 1, memory_order_seq_cst);
+static inline void wake_bell(Bell *bell) {
   if (atomic_load_explicit(&bell->polls, memory_order_seq_cst))
     ring_pipe(bell);
   else
     syscall(SYS_futex, &bell->rung, FUTEX_WAKE, INT_MAX, NULL, NULL, 0);
+}
+#endif
+
+static inline void relax(void) {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#elif defined(__aarch64__)
+  __asm__ volatile("yield");
+#endif
+}
+
+/* All seq_cst: `needs` was stored before, and a writer that finds `wake_at` lowered has to find it. */
+static inline void lower(_Atomic int64_t *place, int64_t value) {
+  int64_t seen = atomic_load_explicit(place, memory_order_seq_cst);
+  while (value < seen &&
+         !atomic_compare_exchange_weak_explicit(place, &seen, value, memory_order_seq_cst, memory_order_seq_cst))
+    continue;
+}
+
+static inline void ring(Bell *bell) {
+  /* seq_cst: of this and `poll_streams`, which stores `polls` and then looks at the bell, one sees the other */
+  atomic_fetch_add_explicit(&bell->rung, 1, memory_order_seq_cst);
+  wake_bell(bell);
 }
 
 /* Wake everybody whose need is met; again if the value has grown meanwhile. All seq_cst, as in `lower`: the scan comes
@@ -127,6 +154,20 @@ static inline int64_t value_of(const Counter *counter) {
 static inline _Atomic int64_t *stamp_of(const char *rows, int64_t stride, int64_t mask, int64_t row) {
   return (_Atomic int64_t *)(uintptr_t)(rows + (row & mask) * stride);
 }
+
+/* ---- an FMU under Wine: see hosted.c */
+
+enum { NOT_HOSTED = -1 };
+
+/* As `call_step`, when the row of inputs is there. */
+int64_t hosted_step(Member *member, int64_t step);
+
+/* As `advance`, for a unit of one member; NOT_HOSTED: the host does not share the memory that is needed. */
+int hosted_advance(Node *node, Unit *unit, int64_t *ticks);
+
+/* What the host does then. */
+int64_t take_step(Member *member, int64_t step);
+int64_t take_burst(Node *node, int64_t *ticks);
 
 /* ---- streams: see streams.c */
 

@@ -148,7 +148,7 @@ class HostMemory:
             memory = mmap.mmap(descriptor, map_.size, mmap.MAP_SHARED)
             if not seals & fcntl.F_SEAL_SHRINK or memory[:_TOKEN_BYTES].hex() != offer.token:
                 return None
-            return cls(memory, map_, process)
+            return cls(memory, map_, process, os.dup(descriptor))
         except OSError:
             return None
         finally:
@@ -159,6 +159,11 @@ class HostMemory:
         """Where others find this shared memory."""
         assert self._descriptor is not None
         return Offer(os.getpid(), self._descriptor, self._memory[:_TOKEN_BYTES].hex())
+
+    @property
+    def path(self) -> Path | None:
+        """Where a child of this process finds this memory; None if it is private."""
+        return Path(f"/proc/{os.getpid()}/fd/{self._descriptor}") if self._descriptor is not None else None
 
     def participant(self, process: str) -> HostMemory:
         """The same memory for another participant of this process."""

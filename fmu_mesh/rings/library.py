@@ -11,6 +11,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import re
 import sys
 from ctypes import CFUNCTYPE, PYFUNCTYPE, c_double, c_int64, c_uint32, c_void_p
 from functools import partial
@@ -19,7 +20,7 @@ from typing import Final
 
 from ..errors import ConfigurationError
 
-__all__ = ["LIBRARY_VARIABLE", "LibraryFunctions", "library_missed", "load_library", "why_no_library"]
+__all__ = ["LIBRARY_VARIABLE", "LibraryFunctions", "host_program", "library_missed", "load_library", "why_no_library"]
 
 LIBRARY_VARIABLE: Final = "FMU_MESH_LIBRARY"
 """An environment variable: `none` runs without the library, `shipped` with that of the package also on a platform where
@@ -31,6 +32,7 @@ TRIED_ON: Final = ("linux-x86_64",)
 _SHIPPED_FOR: Final = ("linux-x86_64", "linux-aarch64")
 """The platforms whose library is in the package; it needs glibc."""
 
+_SOURCE: Final = re.compile(rb"[0-9a-f]{64}  [\w./]+")
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
@@ -58,6 +60,7 @@ class LibraryFunctions:
         self.sleep_for = CFUNCTYPE(c_int64, address, c_uint32, address, c_int64, c_int64, address)(("sleep_for", slow))
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
+        self.host_ask = CFUNCTYPE(c_int64, address)(("host_ask", slow))
         self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
         self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
         by_cvode = CFUNCTYPE(ctypes.c_int, c_double, address, address, address)
@@ -136,12 +139,29 @@ def _found(*, to_step: bool) -> tuple[str | None, str | None]:
         if chosen:
             raise ConfigurationError(f"{LIBRARY_VARIABLE} names a library that cannot be loaded: {error}") from error
         return None, f"it cannot be loaded: {error}"
-    for line in _sources_of(loaded, path).splitlines():
+    _check_sources(path, _sources_of(loaded, path))
+    return str(path), None
+
+
+def host_program() -> Path:
+    """The program that runs an FMU for Windows under Wine.
+
+    Raises:
+        ConfigurationError: it is missing, or was built from other sources than those beside it.
+    """
+    path = Path(__file__).with_name("burst-windows-x86_64.exe")
+    if not path.is_file():
+        raise _unusable(f"{path} is missing")
+    _check_sources(path, "\n".join(line.decode() for line in _SOURCE.findall(path.read_bytes())))
+    return path
+
+
+def _check_sources(path: Path, sources: str) -> None:
+    for line in sources.splitlines():
         digest, _, name = line.partition("  ")
         source = _PACKAGE / name
         if source.is_file() and hashlib.sha256(source.read_bytes()).hexdigest() != digest:
             raise _unusable(f"{path} was built from another version of {source}")
-    return str(path), None
 
 
 def _sources_of(loaded: ctypes.CDLL, path: Path) -> str:

@@ -4,16 +4,15 @@ Owns no memory but that of the tables; who makes a table keeps what its addresse
 library is missing: then the tables are only structures.
 """
 
-# Why not `cffi.FFI().cdef(header)`, which could read the header as well: its parser of C takes 40 to 60 ms at the start
-# of each process of a mesh, these expressions take less than one. That the header is the one of the library is known
-# by its SHA-256, which `library.py` compares, so the sizes of the structures need no look of their own.
+# Why not `cffi.FFI().cdef(header)`: its parser of C takes 40 to 60 ms at the start of each process of a mesh, these
+# expressions less than one. `library.py` compares the SHA-256 of the header, so the sizes need no look of their own.
 
 from __future__ import annotations
 
 import ctypes
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from ctypes import POINTER, Structure, c_bool, c_double, c_int32, c_int64, c_void_p
+from ctypes import POINTER, Structure, c_bool, c_char, c_double, c_int32, c_int64, c_void_p
 from enum import IntEnum
 from keyword import iskeyword
 from pathlib import Path
@@ -52,6 +51,7 @@ __all__ = [
     "Participant",
     "Peer",
     "Piece",
+    "Region",
     "RowBase",
     "Said",
     "Span",
@@ -65,8 +65,6 @@ __all__ = [
     "UnitTable",
     "Wish",
     "WorkKind",
-    "WorkTable",
-    "WorkerTable",
     "declared",
     "library",
     "table",
@@ -141,6 +139,7 @@ _KINDS: Final[dict[str, Any]] = {
     "int32_t": c_int32,
     "double": c_double,
     "uint8_t": c_bool,  # a truth of FMI 3.0
+    "char": c_char,
 }
 """The types of the fields; `declared` adds each structure."""
 
@@ -187,6 +186,11 @@ class Participant(Structure):
 @declared("Wish")
 class Wish(Structure):
     """One value of a counter that somebody waits for."""
+
+
+@declared("Region")
+class Region(Structure):
+    """Memory of this process that the host of an FMU needs."""
 
 
 @declared("Gate")
@@ -407,16 +411,6 @@ class CopyOutput(Structure):
     """Where the rows of one copy have an output."""
 
 
-@declared("Work")
-class WorkTable(Changed):
-    """What is done with many copies."""
-
-
-@declared("Worker")
-class WorkerTable(Structure):
-    """A thread of copies."""
-
-
 class NativeStep(NamedTuple):
     """How an FMU takes a step without Python: the tables of `call_step`.
 
@@ -427,6 +421,9 @@ class NativeStep(NamedTuple):
         getters: write the rows of `RowBase.OUTPUT` and `RowBase.WATCHED`, or buffers.
         stores: from buffers to these rows.
         kept: what the addresses point to.
+        host: the `Host` that runs the FMU; 0: this process does.
+        regions: the memory that the addresses point to, for the host.
+        share: lets the host map memory of a run, with its path, and its address and size here.
     """
 
     kind: StepKind
@@ -439,6 +436,9 @@ class NativeStep(NamedTuple):
     stores: Sequence[Move]
     kept: Sequence[object]
     lines: ctypes.Array[Any] | None = None
+    host: int = 0
+    regions: Sequence[Region] = ()
+    share: Callable[[Path | None, int, int], None] | None = None
 
 
 def table(kind: Any, items: Sequence[Any]) -> Any:  # noqa: ANN401 ctypes has no type for an array of any structure

@@ -42,6 +42,16 @@ _PIECE_S: Final = 0.05
 _MANY_POINTS: Final = 4096
 
 
+@native.declared("Work")
+class WorkTable(native.Changed):
+    """What is done with many copies."""
+
+
+@native.declared("Worker")
+class WorkerTable(ctypes.Structure):
+    """A thread of copies."""
+
+
 class CopyThreads:
     """So many threads for copies; without the library there is one.
 
@@ -61,12 +71,12 @@ class CopyThreads:
         memory = HostMemory.private(map_, names[0])
         self._members = [memory.participant(name) for name in names]
         self._done = [memory.progress[name] for name in names]
-        self._copies, self._work = copies, native.WorkTable(copies=ctypes.addressof(copies))
+        self._copies, self._work = copies, WorkTable(copies=ctypes.addressof(copies))
         places = [
-            native.WorkerTable(own.place, memory.grant.address, done.address, ctypes.addressof(self._work), first, end)
+            WorkerTable(own.place, memory.grant.address, done.address, ctypes.addressof(self._work), first, end)
             for own, done, (first, end) in zip(self._members, self._done, self.parts, strict=True)
         ]
-        self._workers = native.table(native.WorkerTable, places)
+        self._workers = native.table(WorkerTable, places)
         self._handed_over: list[Callable[[], object]] = []
         self._error: BaseException | None = None
         self._others = [Thread(target=self._serve, args=[number], daemon=True) for number in range(1, threads)]

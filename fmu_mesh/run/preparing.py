@@ -186,7 +186,7 @@ def planned(
     if options.keys_from is not None:
         system = _repeated(system, Path(options.keys_from))
     system = with_feedthrough(system, located, loaded.findings(), warnings)
-    _check_host(loaded.config, obstacles, warnings)
+    _check_host(loaded.config, descriptions, obstacles, warnings)
     contents = {name: content(Path(own.fmu), located[name]) for name, own in system.instances.items()}
     plan = make_plan(system, findings=obstacles, contents=contents)
     warn_of_endings(loaded, system.records, warnings)
@@ -207,7 +207,9 @@ def planned(
     return state.begin(run, options.replaced) if state is not None else run
 
 
-def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None:
+def _check_host(
+    config: Config, descriptions: Mapping[str, ModelDescription], obstacles: Findings, warnings: Findings
+) -> None:
     """Find what this host cannot do for a mesh, and say whom the mesh trusts here."""
     own = {name: section for name, section in config.instances.items() if config.process_of(section).is_sandboxed}
     elsewhere = {name: bool(section.host or section.interpreter) for name, section in own.items()}
@@ -217,6 +219,9 @@ def _check_host(config: Config, obstacles: Findings, warnings: Findings) -> None
         if config.process_of(section).sandbox == "wasm" and not section.follows_fmi:
             found = f"wasm for '{name}', which is no FMU and has no sources for a compiler of C"
             obstacles.add(f"instances.{name}.process.sandbox", found, "`sandbox: none` for this instance")
+    for name in own:
+        if name in descriptions and descriptions[name].runs == "wine":
+            obstacles.add("process.sandbox", f"a sandbox for '{name}', which runs under Wine", "`sandbox: none`")
     if (problem := config.recovery_problem) is not None:
         obstacles.add(*problem)
     if (group := config.runtime.share_with) is not None:

@@ -26,6 +26,7 @@ __all__ = [
     "Kind",
     "ModelDescription",
     "PlainValue",
+    "Runs",
     "Value",
     "Variability",
     "Variable",
@@ -38,6 +39,8 @@ Causality = Literal[
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
 Kind = Literal["co_simulation", "model_exchange"]
+Runs = Literal["native", "wine"]
+"""What runs the library of an FMU: the process itself, or Wine."""
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -213,6 +216,11 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     def __repr__(self) -> str:
         version = f"FMI {self.fmi_version}" if self.fmi_version else self.kind
         return f"<ModelDescription of {self.model_name}: {version}, {counted(len(self.variables), 'variable')}>"
+
+    @property
+    def runs(self) -> Runs:
+        """What runs it on this system; `wine` if it only has a library for Windows."""
+        return "wine" if self.library is not None and self.library.endswith(".dll") else "native"
 
     @property
     def step_size(self) -> float | None:

@@ -19,7 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-from fmus.build import find_compiler
+from fmus.build import WINDOWS_FROM_LINUX, Platform, find_compiler, this_platform
 
 __all__ = ["MODELS", "build_event_fmu", "event_source_fmu"]
 
@@ -27,7 +27,7 @@ SOURCES = Path(__file__).resolve().parent / "src" / "events"
 FIRST_INTEGER = 100
 FIRST_CLOCK = 200
 TIME = 15
-FLAGS = ("-O1", "-std=gnu99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-fPIC", "-shared", "-Wl,-Bsymbolic")
+FLAGS = ("-O1", "-std=gnu99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off")
 
 Version = Literal[1, 2, 3]
 Role = Literal["read", "fixed", "tunable", "discrete", "continuous"]
@@ -192,7 +192,8 @@ def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -
         version: of FMI; in 1.0 only model exchange is there.
         folder: made if missing.
         changes: attributes of the co-simulation element that differ, such as ``canGetAndSetFMUstate="false"``; with
-            ``only="model_exchange"`` or ``"co_simulation"`` the other kind is not declared.
+            ``only="model_exchange"`` or ``"co_simulation"`` the other kind is not declared; with ``runs="windows"`` its
+            only library is for Windows.
     """
     model = MODELS[name]
     label = hashlib.sha256(repr(sorted(changes.items())).encode()).hexdigest()[:8] if changes else ""
@@ -201,11 +202,14 @@ def build_event_fmu(name: str, version: Version, folder: Path, **changes: str) -
         return built
     folder.mkdir(parents=True, exist_ok=True)
     guid = f"{{{hashlib.sha256(f'{name}{version}{label}'.encode()).hexdigest()[:32]}}}"
+    platform = WINDOWS_FROM_LINUX if changes.pop("runs", None) else this_platform()
     description = {1: _fmi1, 2: _fmi2, 3: _fmi3}[version](name, model, guid, changes)
-    platform = "x86_64-linux" if version == 3 else "linux64"
+    folder_name = platform.name_in_fmi3 if version == 3 else platform.name
     with zipfile.ZipFile(folder / f"{built.name}.{os.getpid()}.tmp", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("modelDescription.xml", description)
-        archive.writestr(f"binaries/{platform}/{name}.so", _compiled(name, model, version, guid))
+        archive.writestr(
+            f"binaries/{folder_name}/{name}{platform.suffix}", _compiled(name, model, version, guid, platform)
+        )
     written = Path(archive.filename or "")
     with suppress(
         FileExistsError
@@ -246,14 +250,16 @@ def event_source_fmu(
     return target
 
 
-def _compiled(name: str, model: Model, version: Version, guid: str) -> bytes:
+def _compiled(name: str, model: Model, version: Version, guid: str, platform: Platform) -> bytes:
     headers = str(files("fmpy") / "c-code")
     with tempfile.TemporaryDirectory(prefix="fmu_build_") as folder:
         Path(folder, "variables.h").write_text(_header(model), encoding="utf-8")
         sources = [str(SOURCES / file) for file in (f"fmi{version}.c", "stepping.c", f"{name}.c")]
-        library = Path(folder, "library.so")
+        library = Path(folder, f"library{platform.suffix}")
         defines = [f'-DFMU_GUID="{guid}"', f"-DMODEL_IDENTIFIER={name}"]
-        command = [*find_compiler(), *FLAGS, *defines, f"-I{folder}", f"-I{SOURCES}", f"-I{headers}"]
+        own_flags = ["-Wl,-Bsymbolic"] if platform.suffix == ".so" else []
+        command = [*(platform.compiler or find_compiler()), *FLAGS, *platform.link_flags, *own_flags, *defines]
+        command += [f"-I{folder}", f"-I{SOURCES}", f"-I{headers}"]
         subprocess.run([*command, "-o", str(library), *sources, "-lm"], check=True)
         return library.read_bytes()
 

@@ -74,7 +74,7 @@ def test_many_failed_tests_are_not_tried_again(tmp_path: Path) -> None:
 
 STAGES = (
     "arm64 bridge browser containers cuts examples floods gazebo hosts kills learning live_data recovery ros slurm tsan"
-    " zenoh_bridge"
+    " wine zenoh_bridge"
 )
 
 

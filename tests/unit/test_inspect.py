@@ -123,8 +123,9 @@ def test_variables_are_found_by_name_and_unknown_one_is_told_with_nearest(
 
 
 def test_an_fmu_that_cannot_run_here_is_shown_with_the_reason(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("PATH", "/nonexistent")  # without Wine
     path = repacked(
         tmp_path / "elsewhere.fmu",
         keep=lambda name: name == "modelDescription.xml",
@@ -137,6 +138,7 @@ def test_an_fmu_that_cannot_run_here_is_shown_with_the_reason(
     assert "Runs here    no, see Problems" in page
     assert "Problems (2)" in page
     assert "has no binary for this platform (linux64); it has: win64." in " ".join(page.split())
+    assert "or with its sources; `apt install wine64` lets it run under Wine." in " ".join(page.split())
     assert "attribute 'colour'" in " ".join(page.split())
 
 

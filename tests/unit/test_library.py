@@ -21,6 +21,7 @@ from hatchling.builders.wheel import WheelBuilder
 import build_library
 from fmu_mesh.errors import ConfigurationError
 from fmu_mesh.instances.fmi.model_exchange.dormand_prince import Solved
+from fmu_mesh.instances.fmi.wine_library import Request
 from fmu_mesh.rings import native
 from fmu_mesh.rings.library import LIBRARY_VARIABLE, TRIED_ON, library_missed, load_library, why_no_library
 from tests.helpers import write_config
@@ -66,7 +67,9 @@ needs_the_compiler = pytest.mark.skipif(not built_by_the_pinned_compiler(), reas
 
 @pytest.mark.parametrize("platform", build_library.TARGETS)
 def test_the_library_in_the_tree_was_built_from_the_sources_in_tree(platform: str) -> None:
-    assert build_library.manifest().encode() in build_library.library_path(platform).read_bytes(), "make library"
+    assert build_library.manifest(platform).encode() in build_library.library_path(platform).read_bytes(), (
+        "make library"
+    )
 
 
 @needs_the_compiler
@@ -230,7 +233,7 @@ def test_library_of_older_sources_is_error_that_says_how_to_build_it(clone: Path
 
 
 @pytest.mark.parametrize(
-    "known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd, Solved]
+    "known", [native.StepKind, native.Stage, native.RowBase, native.Change, native.BurstEnd, Solved, Request]
 )
 def test_an_enumeration_has_the_names_of_the_header_in_their_order(known: type[IntEnum]) -> None:
     header = (LIBRARY.parent / "burst.h").read_text()

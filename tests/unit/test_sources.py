@@ -393,15 +393,29 @@ def test_two_processes_at_once_compile_without_harm(tmp_path: Path, cache: Path)
     assert [copy.read_bytes() for copy in copies] == [library.read_bytes()] * 2
 
 
-def test_an_fmu_for_another_platform_without_sources_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("others", "ways_out"),
+    [
+        (["win64", "aarch64-darwin"], "; `apt install wine64` lets it run under Wine."),
+        (["win32"], ", or for 64-bit Windows, to run under Wine: libraries for 32-bit Windows are not supported yet."),
+        (["aarch64-darwin"], "."),
+    ],
+)
+def test_an_fmu_for_another_platform_without_sources_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, others: list[str], ways_out: str
+) -> None:
+    monkeypatch.setenv("PATH", "/nonexistent")  # without Wine
     path = repacked(
         tmp_path / "elsewhere.fmu",
         keep=lambda name: name == "modelDescription.xml",
-        add={"binaries/win64/Gain.dll": b"", "binaries/aarch64-darwin/Gain.dylib": b""},
+        add={f"binaries/{name}/Gain.{'dll' if 'win' in name[:3] else 'dylib'}": b"" for name in others},
     )
 
-    with pytest.raises(LoadFailed, match=r"no binary for this platform \(linux64\); it has: aarch64-darwin, win64"):
+    with pytest.raises(LoadFailed) as refused:
         read_description(path)
+
+    assert f"no binary for this platform (linux64); it has: {', '.join(sorted(others))}." in refused.value.message
+    assert refused.value.hint == f"Export it for this platform, or with its sources{ways_out}"
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ class NumberBuffer:
         self._is_boolean = type_ == "Boolean"
         self._signs = signs
         self.address: int = self._memory.ctypes.data
+        self.size = self._memory.nbytes
 
     def load(self, elements: Sequence[Any] | NDArray[Any]) -> None:
         """Write numbers to the memory; `OverflowError` if the C type cannot hold one of them, or its opposite."""

@@ -172,14 +172,14 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
 
     def summary(self, description: ModelDescription) -> str:
-        """The version of FMI and the solver; for co-simulation, which has its own, the tolerance if one is set."""
+        """The version of FMI; the solver, or for co-simulation a tolerance that is set; whether it runs under Wine."""
         if description.kind == "co_simulation":
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
             settings = self.solver_settings(description)
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
-        return f"FMI {description.fmi_version}{solver}"
+        return f"FMI {description.fmi_version}{solver}{', under Wine' if description.runs == 'wine' else ''}"
 
     def other_kind(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""
@@ -259,11 +259,11 @@ class FmuKind(Kind[FmuConfig]):
         return content_of(path)
 
     def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
-        """What the libraries of the FMU have that a process has only once; nothing of those that are compiled here."""
+        """What its libraries have that a process has only once; nothing of what is compiled or runs under Wine."""
         from .archive.archive import opened  # noqa: PLC0415  as above
         from .archive.library_names import claims_of  # noqa: PLC0415  as above
 
-        if description.library is None:
+        if description.library is None or description.runs == "wine":
             return {}
         with opened(path, Terms(limits, section.sha256)) as fmu:
             return claims_of(fmu, description.library)

@@ -22,7 +22,7 @@ from fmpy import freeLibrary
 
 from .archive.shared_library import SYMBOL, SharedLibrary, read_shared_library
 
-__all__ = ["MISSING", "FmuLibrary", "calling"]
+__all__ = ["MISSING", "FmuLibrary", "absent", "calling"]
 
 MISSING: Final = 999
 """Our own status of a function that the library of an FMU does not have."""
@@ -99,6 +99,8 @@ _PROCESS: Final = _Library(None)
 class FmuLibrary(_Library):
     """The library of one FMU; `OSError` if it cannot be loaded."""
 
+    host = None  # this process calls its functions itself
+
     def __init__(self, path: Path, *, deep_binding: bool) -> None:
         self.missing: set[str] = set()  # the functions that were asked for and that it does not have
         self._folder = f"{path.parents[2]}/".encode()
@@ -118,7 +120,7 @@ class FmuLibrary(_Library):
             if "fmi" not in name:
                 raise
         self.missing.add(name)
-        function = _ABSENT(lambda: MISSING)
+        function = absent()
         setattr(self, name, function)  # whoever has its address needs it for as long as the library
         return function
 
@@ -129,16 +131,27 @@ class FmuLibrary(_Library):
         return set[bytes]().union(*(one.imports() for one in own))
 
 
+def absent() -> Any:  # noqa: ANN401 as in ctypes
+    """A function in the place of one that a library does not have."""
+    return _ABSENT(lambda: MISSING)
+
+
 class _LoadedBefore:
-    """Goes before FMPy's class of an FMU, which loads the library again: that gives the same one."""
+    """Goes before FMPy's class of an FMU, which would load the library itself."""
 
     made_by: Callable[[], object]  # what FMPy has called last to make an instance
 
-    def __init__(self, library: FmuLibrary, environment: int, **keywords: Any) -> None:  # noqa: ANN401 FMPy's own
-        self._library = library
+    _loadFunctions: Callable[[], None]  # noqa: N815 FMPy's name
+
+    def __init__(self, library: Any, environment: int, **keywords: Any) -> None:  # noqa: ANN401 of either kind; FMPy's own
+        self.dll = library
         self.environment = environment
-        super().__init__(**keywords)
-        library.close()
+        vars(self).update(keywords, fmiCallLogger=None, component=None, callbacks=None, _functions={})
+        self._loadFunctions()
+
+    def freeLibrary(self) -> None:  # noqa: N802 FMPy's name
+        """Unload the library."""
+        self.dll.close()
 
     def for_another(self, environment: int) -> Self:
         """The same library for another instance with an environment of its own: functions are looked up once."""
@@ -151,15 +164,6 @@ class _LoadedBefore:
         self.component = self.made_by()
         if self.component is None:
             raise RuntimeError(_NOT_MADE)
-
-    @property
-    def dll(self) -> FmuLibrary:
-        """The library."""
-        return self._library
-
-    @dll.setter
-    def dll(self, again: object) -> None:
-        """FMPy assigns what it has loaded."""
 
 
 def calling(fmpy_class: type[Any]) -> type[Any]:

@@ -26,6 +26,7 @@ from .calls import FmpyCalls, cffi_function, pointer
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
 from .step_options import Terms
+from .wine_library import WineLibrary
 
 __all__ = ["FmuFunctions", "LoadedFmu"]
 
@@ -101,7 +102,7 @@ class _Files:
             self.used_by.remove(model)
         if self.used_by:
             return
-        if self._loaded is not None and not self._stays and not process_ends():
+        if self._loaded is not None and (self._loaded.dll.host or (not self._stays and not process_ends())):
             with suppress(FMICallException, OSError):
                 self._loaded.freeLibrary()
         self._loaded = None
@@ -151,9 +152,16 @@ class LoadedFmu:
 
     def _load(self) -> Any:  # noqa: ANN401 FMPy is untyped
         functions, description = self._fmu.functions, self._fmu.description
-        path = self._folder / library_name(description.model_identifier, description.fmi_version, [description.library])
+        names = [description.library]
+        path = self._folder / library_name(
+            description.model_identifier, description.fmi_version, names, description.runs
+        )
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
-            library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
+            library: FmuLibrary | WineLibrary
+            if description.runs == "wine":
+                library = WineLibrary(path, functions.library, self._fmu.name)
+            else:
+                library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
             if description.guest_memory is not None:
                 memory, limits = ctypes.c_int64(description.guest_memory), self._fmu.timeouts
                 library.fmu_mesh_guest_limits(memory, ctypes.c_double(limits.call), ctypes.c_double(limits.step))

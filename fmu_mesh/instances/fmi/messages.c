@@ -109,10 +109,15 @@ PUBLIC void log_fmi1_2(void *address, const char *name, int status, const char *
   va_end(values);
 }
 
-PUBLIC void log_fmi3(void *address, int status, const char *category, const char *text) {
+/* A message that is formatted already: from a host under Wine (rings/hosted.c). */
+void log_of_host(const void *address, const char *name, int status, const char *category, const char *text) {
   Message new;
-  begin(&new, address, NULL, status, category);
+  begin(&new, address, name, status, category);
   take(&new, text ? text : "", NULL);
+}
+
+PUBLIC void log_fmi3(void *address, int status, const char *category, const char *text) {
+  log_of_host(address, NULL, status, category, text);
 }
 
 /* ---- for Python */

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import NotFinite
 from ...rings import native
-from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Span, Stage, StepKind
+from ...rings.native import CopyCall, MemberTable, Move, NativeStep, Region, Span, Stage, StepKind
 from ...rings.ring import Ring
 from ...simtime import TimeGrid
 from ...variables.model_description import ModelDescription, Variable
@@ -73,7 +73,7 @@ class NativeInstance(FmuInstance):
         buffers = [part.buffer for part in (*self._setters, *self._getters) if part.buffer is not None]
         if not all(isinstance(buffer, NumberBuffer) for buffer in buffers):
             return
-        self._native = self._tables()
+        self._native = self._hosted(self._tables(), inputs)
         self._keep += self._native.kept
         self._member = member = self._table(self._native, outputs)
         take = cffi_function(native.library.member_step, _MEMBER_STEP)
@@ -223,6 +223,21 @@ class NativeInstance(FmuInstance):
             kept=(self._said, *self._setters, *self._getters),
         )
 
+    def _hosted(self, tables: NativeStep, inputs: Ring) -> NativeStep:
+        """The tables with the host of the FMU, if there is one, and all memory that their addresses point to.
+
+        The equations of model exchange are solved here; then each function is called by itself.
+        """
+        host = self._fmu.dll.host
+        if host is None or tables.kind == StepKind.EQUATIONS:
+            return tables
+        own = [Region(inputs.address, inputs.rows * inputs.stride)]
+        for part in (*self._setters, *self._getters):
+            own.append(Region(address_of(part.arguments[0]), 4 * len(part.variables)))
+            if isinstance(part.buffer, NumberBuffer):
+                own.append(Region(part.buffer.address, part.buffer.size))
+        return tables._replace(host=host.address, regions=own, share=host.map)
+
     def _table(self, tables: NativeStep, outputs: Sequence[Ring]) -> MemberTable:
         """The member that takes the steps in this process."""
         own = [native.OutputTable(ring.address, ring.stride, ring.mask) for ring in outputs]
@@ -231,6 +246,7 @@ class NativeInstance(FmuInstance):
             component=tables.component,
             do_step=tables.do_step,
             said=tables.said,
+            host=tables.host,
             start_time=self._start_time,
             base_step_size=self._base_step_size,
             step_size=self._step_size,
@@ -239,6 +255,7 @@ class NativeInstance(FmuInstance):
             bases=(ctypes.c_void_p * native.RowBase.FIRST_GATE)(),
         )
         member.give(loads=tables.loads, setters=tables.setters, getters=tables.getters, stores=tables.stores)
+        member.give(regions=tables.regions)
         return member
 
     def _fail_to_set(self, step: int, status: int) -> None:

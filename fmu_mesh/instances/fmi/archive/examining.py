@@ -18,18 +18,19 @@ from lxml import etree
 
 from ....archives.safe_xml import safe_xml
 from ....errors import LoadFailed
+from ....variables.model_description import Runs
+from ..wine import INSTALL_WINE, wine_program
 from .archive import Contents, OpenFmu
 from .repairing import repair
 
 __all__ = ["examine", "find_library", "library_folders", "library_name", "names_here", "source_names"]
 
 _SHOWN: Final = 3
-_EXPORT: Final = "Export it for this platform, or with its sources."
 _COMPONENT: Final = (
     "Its binary for WebAssembly is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with "
     "its sources, which `process: {sandbox: wasm}` compiles for WebAssembly."
 )
-_SUFFIX: Final = str(fmpy.sharedLibraryExtension)
+_SUFFIXES: Final[dict[Runs, str]] = {"native": str(fmpy.sharedLibraryExtension), "wine": ".dll"}
 
 _ARM: Final = "aarch64-linux"
 _PROCESSORS: Final = {62: "x86_64", 183: "aarch64"}
@@ -83,21 +84,23 @@ def _what_it_is(path: Path, names: Collection[str]) -> str:
     return "An FMU that was zipped inside a folder of its own must be zipped again without that folder."
 
 
-def library_folders(fmi_version: str) -> tuple[str, ...]:
-    """What FMUs call this platform, the name of the standard first (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1).
+def library_folders(fmi_version: str, runs: Runs = "native") -> tuple[str, ...]:
+    """What FMUs call a platform, the name of the standard first (FMI 1.0, 2.3; 2.0, 2.3; 3.0, 2.5.1).
 
     For ARM, FMI 2.0 takes the name of FMI 3.0. OpenModelica writes that of Debian, or on ARM itself `linux64`.
     """
+    if runs == "wine":
+        return ("x86_64-windows" if fmi_version.startswith("3") else "win64",)
     if fmpy.platform_tuple == _ARM and not fmi_version.startswith("3"):
         return _ARM, f"{_ARM}-gnu", "linux64"
     return (fmpy.platform_tuple if fmi_version.startswith("3") else fmpy.platform,)
 
 
-def library_name(identifier: str, fmi_version: str, names: Iterable[str | None] = ()) -> str:
-    """The path of the library for this platform inside an FMU, in the first folder for it that ``names`` has."""
+def library_name(identifier: str, fmi_version: str, names: Iterable[str | None] = (), runs: Runs = "native") -> str:
+    """The path of the library for a platform inside an FMU, in the first folder for it that ``names`` has."""
     there = {name.rpartition("/")[0] for name in names if name is not None}
-    folders = [f"binaries/{folder}" for folder in library_folders(fmi_version)]
-    return f"{next((folder for folder in folders if folder in there), folders[0])}/{identifier}{_SUFFIX}"
+    folders = [f"binaries/{folder}" for folder in library_folders(fmi_version, runs)]
+    return f"{next((folder for folder in folders if folder in there), folders[0])}/{identifier}{_SUFFIXES[runs]}"
 
 
 def names_here(fmu: OpenFmu, names: Iterable[str], fmi_version: str) -> frozenset[str]:
@@ -107,7 +110,7 @@ def names_here(fmu: OpenFmu, names: Iterable[str], fmi_version: str) -> frozense
     """
     own, found = "|".join(library_folders(fmi_version)), set[str]()
     for name in names:
-        if (library := re.fullmatch(rf"(binaries/(?:{own}))(/[^/]*{_SUFFIX})", name)) is not None:
+        if (library := re.fullmatch(rf"(binaries/(?:{own}))(/[^/]*{_SUFFIXES['native']})", name)) is not None:
             begin = fmu.read_begin(name, 20)
             processor = _PROCESSORS.get(int.from_bytes(begin[18:], "little")) if begin.startswith(b"\x7fELF") else None
             if processor not in {None, platform.machine()}:
@@ -126,38 +129,59 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     """Find the library of an FMU for this platform: the one with the required name, or else the only one.
 
     ``identifiers`` are the model identifier of the kind to use, and that of the other kind if there is one. None: the
-    library has to be compiled from sources. `LoadFailed`: there is none for this platform, or there are several.
+    library has to be compiled from sources. Without both, it is that for Windows, if Wine is installed. `LoadFailed`:
+    there is none that can run here, or there are several.
     """
-    identifier, *others_of_it = identifiers
+    identifier = identifiers[0]
     if "/" in identifier or "\\" in identifier or identifier.startswith("."):
         raise LoadFailed(f"'{path}' has the model identifier '{identifier}', which cannot be the name of a library.")
     wanted = library_name(identifier, fmi_version, names)
-    if identifier and wanted in names:
-        return wanted
-    folder = wanted.rpartition("/")[0]
-    there = sorted(name for name in names if name.rpartition("/")[0] == folder and name.endswith(_SUFFIX))
-    known = [name for one in others_of_it if (name := library_name(one, fmi_version, names)) in there]
-    others = [name for name in there if name not in known]
-    if len(others) == 1:
-        return others[0]
-    what = f"'{path}' has no '{wanted}'" if identifier else f"'{path}' has no model identifier to find its library by"
-    if others:
-        raise LoadFailed(
-            f"{what}; it has {' and '.join(map(repr, others))}, and it is not clear which of them to load.",
-            hint="The library must have the name of the model identifier (FMI 2.0, 2.3).",
-        )
+    if (found := _library(path, names, identifiers, fmi_version, "native")) is not None:
+        return found
     if identifier and source_names(names):
         return None
-    if known:
+    what = f"'{path}' has no '{wanted}'" if identifier else _WITHOUT_IDENTIFIER.format(path)
+    if known := [name for one in identifiers[1:] if (name := library_name(one, fmi_version, names)) in names]:
         raise LoadFailed(
             f"{what}; it has only '{known[0]}', the library of its other kind.",
             hint="Leave `kind` to the other one, or export it with both libraries.",
         )
+    runs_windows = fmpy.platform_tuple == "x86_64-linux"
+    windows = _library(path, names, identifiers, fmi_version, "wine") if runs_windows else None
+    if windows is not None and wine_program() is not None:
+        return windows
     if not identifier:
         raise LoadFailed(f"{what}, nor a library for this platform.", hint="Report it to the maker of its tool.")
     platforms = sorted({name.split("/")[1] for name in names if re.fullmatch(r"binaries/[^/]+/.+", name)})
+    ways = "Export it for this platform, or with its sources"
+    if windows is not None:
+        ways += f"; {INSTALL_WINE}"
+    elif runs_windows and {"win32", "x86-windows"} & set(platforms):
+        ways += ", or for 64-bit Windows, to run under Wine: libraries for 32-bit Windows are not supported yet"
     raise LoadFailed(
-        f"'{path}' has no binary for this platform ({folder.rpartition('/')[2]}); it has: "
+        f"'{path}' has no binary for this platform ({wanted.split('/')[1]}); it has: "
         f"{', '.join(platforms) or 'no platform at all'}.",
-        hint=_COMPONENT if any(name.startswith("wasm") for name in platforms) else _EXPORT,
+        hint=_COMPONENT if any(name.startswith("wasm") for name in platforms) else f"{ways}.",
     )
+
+
+def _library(
+    path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str, runs: Runs
+) -> str | None:
+    """The library of an FMU for one platform; `LoadFailed` if there are several, none of them with a known name."""
+    wanted, *known = [library_name(one, fmi_version, names, runs) for one in identifiers]
+    if identifiers[0] and wanted in names:
+        return wanted
+    folder, suffix = wanted.rpartition("/")[0], _SUFFIXES[runs]
+    there = sorted(name for name in names if name.rpartition("/")[0] == folder and name.endswith(suffix))
+    others = [name for name in there if name not in known]
+    if len(others) > 1:
+        what = f"'{path}' has no '{wanted}'" if identifiers[0] else _WITHOUT_IDENTIFIER.format(path)
+        raise LoadFailed(
+            f"{what}; it has {' and '.join(map(repr, others))}, and it is not clear which of them to load.",
+            hint="The library must have the name of the model identifier (FMI 2.0, 2.3).",
+        )
+    return others[0] if others else None
+
+
+_WITHOUT_IDENTIFIER: Final = "'{}' has no model identifier to find its library by"

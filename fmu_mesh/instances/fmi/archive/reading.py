@@ -19,7 +19,7 @@ from fmpy.validation import validate_model_description
 from msgspec.structs import replace
 
 from ....errors import LoadFailed
-from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription
+from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription, Runs
 from ..step_options import Terms
 from .archive import Contents, OpenFmu, opened
 from .declared_variables import number, states_of, variables_of
@@ -64,7 +64,8 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
     identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
     names = names_here(fmu, contents.names, version) if to_run else frozenset()
     library = find_library(path, names, identifiers, version) if to_run else None
-    if library is not None and library != (wanted := library_name(identifiers[0], version, names)):
+    runs: Runs = "wine" if library is not None and library.endswith(".dll") else "native"
+    if library is not None and library != (wanted := library_name(identifiers[0], version, names, runs)):
         what = (
             f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"
         )

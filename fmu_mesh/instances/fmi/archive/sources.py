@@ -34,6 +34,7 @@ from ....errors import LoadFailed
 from ....variables.model_description import Kind, ModelDescription
 from ..step_options import Terms
 from ..webassembly import compiling
+from ..wine import wine_environment
 from .archive import OpenFmu, in_new_folder, opened
 from .examining import examine, library_folders, library_name, source_names
 from .library_names import rename_libraries
@@ -160,7 +161,7 @@ def describe(
     """Read the model description of an FMU and get it ready to run, while its archive is open once.
 
     If it has no library for this platform, or is to run in a sandbox of WebAssembly with so many bytes of
-    ``guest_memory``, its sources are compiled into the cache; ``tell`` is called before that.
+    ``guest_memory``, its sources are compiled into the cache, or Wine is prepared; ``tell`` is called before that.
     Its SHA-256 is known afterwards, so that `content_of` does not read it again. If its sources do not compile,
     `LoadFailed` has the first lines of the compiler.
     """
@@ -170,6 +171,8 @@ def describe(
         if model.library is None:
             with tempfile.TemporaryDirectory(prefix="fmu_mesh-") as folder, reading(path):
                 _fill(fmu, tell, model, Path(folder))
+        elif model.runs == "wine":
+            wine_environment(tell)
     return model
 
 
@@ -203,7 +206,7 @@ def _fill(fmu: OpenFmu, tell: Callable[[str], None], model: ModelDescription | N
         _add_library(fmu, folder, model, tell)
     elif model is not None:
         # A link with the name that FMI requires; other libraries of the FMU may refer to the original name.
-        named = folder / library_name(model.model_identifier, model.fmi_version, [model.library])
+        named = folder / library_name(model.model_identifier, model.fmi_version, [model.library], model.runs)
         if not named.exists():
             named.symlink_to(PurePosixPath(model.library or "").name)
 
