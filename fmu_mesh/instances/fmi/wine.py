@@ -6,8 +6,9 @@ share it, and it ends by itself when the last of them has ended (at once in Debi
 """
 
 # Who meets here (ADR 99): any number of processes may ask for the prefix at once, also those of several runs. One makes
-# it, under a lock and with another name, and renames it when it is complete; so nobody ever uses one that is half made,
-# and a maker that was killed leaves a draft that the next one removes. `flock` has no deadline: a thread waits for it.
+# it, under a lock and with another name, and renames it when it is complete; so nobody ever uses one that is half made.
+# The Wine of a maker that was killed goes on: the next maker ends it, and then removes its draft (a server whose folder
+# is gone never ends). `flock` has no deadline: a thread waits for it.
 # Given up: a prefix for each run. It takes ten seconds.
 
 from __future__ import annotations
@@ -129,10 +130,8 @@ def _wait_for(lock: int, prefix: Path) -> None:
 
 def _make(program: Path, prefix: Path) -> None:
     """Make the prefix under another name, and rename it at the end."""
-    draft = prefix.with_name(f"{prefix.name}.draft")
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir(mode=0o700)
-    environment = _environment(draft, _OVERRIDES)
+    draft = prefix.with_name(f"{prefix.name}.{os.getpid()}.draft")
+    server = shutil.which("wineserver")
 
     def run(*command: str) -> str:
         # Wine's services inherit the output, so the end of a pipe would be that of all of them.
@@ -142,16 +141,23 @@ def _make(program: Path, prefix: Path) -> None:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env=environment,
+                env=_environment(draft, _OVERRIDES),
                 check=False,
                 timeout=_PREPARE_S,
             )
             output.seek(0)
             return output.read().decode(errors="replace")
 
+    for left in prefix.parent.glob(f"{prefix.name}.*.draft"):
+        if server:
+            subprocess.run(
+                [server, "--kill"], env=_environment(left, _OVERRIDES), capture_output=True, check=False, timeout=60
+            )
+        shutil.rmtree(left, ignore_errors=True)
+    draft.mkdir(mode=0o700)
     said = run(str(program), "wineboot", "--init")
     variables = run(str(program), "cmd", "/c", "set")
-    if server := shutil.which("wineserver"):
+    if server:
         run(server, "--wait")  # it writes the registry at its end
     if not (draft / "system.reg").is_file():
         raise LoadFailed(f"Wine cannot make a prefix; it says: {said.strip()[-500:] or 'nothing'}")
