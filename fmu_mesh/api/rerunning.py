@@ -153,6 +153,10 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
         on_notice(f"'{path}' was made by fmu_mesh {version}, and this is {__version__}")
     if differs := machine_difference(metadata.versions, machine()):
         on_notice(f"'{path}' was made on another machine than this, so last digits may differ: {differs}")
+    for name, own in metadata.models.items():
+        now = plan.loaded.config.instances[name].computed_by(plan.plan.system.instances[name].description)
+        if own.computed_by and now != own.computed_by:
+            on_notice(f"'{name}' was computed by {own.computed_by}, and now by {now}, so last digits may differ")
     return PlannedRerun(plan, values, last_point, first)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
+from fmu_mesh.instances.fmi.wine import wine_version
 from tests.equivalence.reference import Pipe, Reference, Table, Unit
 from tests.fmus.event_fmus import Version, build_event_fmu
-from tests.fmus.helpers import FMUS, session_folder
+from tests.fmus.helpers import FMUS, find_fmu, session_folder
 from tests.helpers import BY_STREAMS, Place, rows_of, write_config
 from tests.wine.windows import NEEDS_WINE, run_dlls, windows_event_fmu, windows_fmu
 
@@ -152,6 +154,52 @@ def test_all_versions_and_kinds_give_the_floats_of_their_native_twins(
 
     assert windows == run("native", lambda model: build_event_fmu(model, version, session_folder()))
     place.assert_nothing_left(within_s=5.0)
+
+
+@pytest.mark.parametrize("arguments", [(), ("--local",)], ids=["distributed", "local"])
+def test_texts_and_bytes_of_fmi3_pass_as_in_the_native_twin(place: Place, arguments: Sequence[str]) -> None:
+    """Of two instances in a row: what a getter returns, and what a setter takes."""
+    kinds = ["binary", "binary_array", "string", "string_array", "boolean", "uint8", "float32"]
+
+    def run(name: str, fmu: Path) -> bytes:
+        values = {"columns": 2, "binary_in": "AAH/", "binary_array_in": [["AA==", ""], ["/w==", "AAAA"]], "string_in": "ä"}
+        content = {
+            "mesh": name,
+            "simulation": {"stop_time": 0.5, "step_size": 0.1},
+            "instances": {
+                "first": {"fmu": str(fmu), "start_values": values},
+                "second": {"fmu": str(fmu), "start_values": {"columns": 2}},
+            },
+            "connections": [f"first.{kind}_out -> second.{kind}_in" for kind in kinds],
+            "record": {"file": f"{name}.csv", "variables": [f"second.{kind}_out" for kind in kinds]},
+        }
+        config = place.folder / f"{name}.yaml"
+        config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        launched = place.run("launch", config, *arguments)
+        assert launched.wait() == 0, launched.errors
+        return (place.folder / f"{name}.csv").read_bytes()
+
+    windows = run("windows", windows_fmu("AllTypes3"))
+
+    assert b"AAH/" in windows
+    assert windows == run("native", find_fmu("AllTypes3", place.folder))
+    place.assert_nothing_left(within_s=5.0)
+
+
+def test_a_result_says_with_which_wine_it_was_computed(place: Place) -> None:
+    config = mesh_of(place, ["pendulum"])
+    result = place.folder / "result.csv"
+    notes = place.folder / "result.csv.json"
+
+    assert place.run("launch", config).wait() == 0
+    models = json.loads(notes.read_text(encoding="utf-8"))["models"]
+    notes.write_text(notes.read_text(encoding="utf-8").replace("under Wine (wine-", "under Wine (wine-1"), encoding="utf-8")
+    again = place.run("rerun", result)
+
+    assert models["pendulum"]["computed_by"].startswith(f"FMI 2.0, under Wine ({wine_version()}")
+    assert models["delay"]["computed_by"] == "FMI 2.0"
+    assert again.wait() == 0, again.errors
+    assert "'pendulum' was computed by FMI 2.0, under Wine (wine-1" in again.errors
 
 
 def test_inspect_and_check_say_that_it_runs_under_wine(place: Place) -> None:

@@ -37,6 +37,7 @@ from ...system.process_sharing import Claims
 from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .step_options import NO_STATE_OF_CVODE, SolverName, SolverSettings, StepOptions, Terms
+from .wine import wine_version
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
@@ -180,6 +181,11 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
         return f"FMI {description.fmi_version}{solver}{', under Wine' if description.runs == 'wine' else ''}"
+
+    def computed_by(self, description: ModelDescription) -> str:
+        """See `InstanceSection`; a Windows FMU uses the C library of Wine."""
+        version = f" ({wine_version()})" if description.runs == "wine" else ""
+        return f"{self.summary(description)}{version}"
 
     def other_kind(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""

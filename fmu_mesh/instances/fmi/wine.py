@@ -29,7 +29,7 @@ from typing import Final
 from ... import files
 from ...errors import LoadFailed
 
-__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program"]
+__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program", "wine_version"]
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
     """
     if (program := wine_program()) is None:
         raise LoadFailed("Wine, which runs Windows FMUs, is not installed.", hint=f"{INSTALL_WINE}.")
-    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", _version(program)).strip("-")
+    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", wine_version()).strip("-")
     if not prefix.is_dir():
         try:
             prefix.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -92,13 +92,18 @@ def windows_uri(path: Path) -> str:
 
 
 @functools.cache
-def _version(program: Path) -> str:
-    asked = [str(program), "--version"]
-    done = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=60)
-    if not done.stdout.startswith("wine-"):
-        said = (done.stderr or done.stdout).strip() or "nothing"
+def wine_version() -> str:
+    """The version in Wine's own words: `wine-8.0 (Debian 8.0~repack-4)`."""
+    program = wine_program() or "wine"
+    try:
+        asked = [str(program), "--version"]
+        done = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=60)
+        said = done.stdout.strip() or done.stderr.strip() or "nothing"
+    except (OSError, subprocess.TimeoutExpired) as error:
+        said = str(error)
+    if not said.startswith("wine-"):
         raise LoadFailed(f"'{program}' does not tell its version; it says: {said[:200]}", hint="Install Wine again.")
-    return done.stdout
+    return said
 
 
 def _environment(prefix: Path, overrides: str) -> dict[str, str]:

@@ -20,6 +20,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from itertools import accumulate, pairwise
 from pathlib import Path
 from struct import pack, unpack
 from types import UnionType
@@ -250,7 +251,12 @@ class WineLibrary:
             elif own.type is _TEXT:
                 place = room.put(_located(own.name, value) + b"\0")
             elif own.items is not None:
-                place = self._put_array(room, name, own, value, _count(arguments, values, index), after)
+                count = _count(arguments, values, index)
+                if own.items is _TEXT or issubclass(own.items, _POINTER):
+                    sizes = (values[index - 1], places[-1]) if own.items is not _TEXT else None
+                    place = self._put_texts(room, name, value, count, sizes, after)
+                else:
+                    place = self._put_array(room, name, own, value, count, after)
             elif own.type is ctypes.c_double:
                 (place,) = unpack("<q", pack("<d", value))
             else:
@@ -265,35 +271,51 @@ class WineLibrary:
         self, room: _Room, name: str, own: _Argument, address: int, count: int, after: list[Callable[[], None]]
     ) -> int:
         """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
-        is_set = "Set" in name
-        if own.items is _TEXT:
-            here = (_PLACE * count).from_address(address)
-            texts = (_TEXT * count).from_address(address)
-            given = [room.put((text or b"") + b"\0") for text in texts] if is_set else [0] * count
-            place = room.put(pack(f"<{count}q", *given))
+        size = count * ctypes.sizeof(own.items)
+        place = room.put(ctypes.string_at(address, size))
 
-            def copy() -> None:
-                self._texts = self._copied(room, place, count)
-                for number, text in enumerate(self._texts):
-                    here[number] = ctypes.addressof(text)
+        def copy() -> None:
+            ctypes.memmove(address, room.taken(place, size), size)
 
-        else:
-            size = count * ctypes.sizeof(own.items)
-            place = room.put(ctypes.string_at(address, size))
-
-            def copy() -> None:
-                ctypes.memmove(address, room.taken(place, size), size)
-
-        if not is_set:
+        if "Set" not in name:
             after.append(copy)
         return place
 
-    def _copied(self, room: _Room, pointers: int, count: int) -> list[Any]:
-        """Texts that the FMU has returned; they live until it returns others."""
+    def _put_texts(  # noqa: PLR0913, PLR0917 as above
+        self,
+        room: _Room,
+        name: str,
+        address: int,
+        count: int,
+        sizes: tuple[int, int] | None,
+        after: list[Callable[[], None]],
+    ) -> int:
+        """The same for pointers to texts; with ``sizes``, of this process and of the host, to bytes (FMI 3.0, 2.2.6.2)."""
+        here = (_PLACE * count).from_address(address)
+        given = [0] * count
+        if "Set" in name:
+            own = (ctypes.c_size_t * count).from_address(sizes[0]) if sizes else [-1] * count
+            data = [ctypes.string_at(one, size) if one else b"" for one, size in zip(here, own, strict=True)]
+            given = [room.put(one + b"\0") for one in data]
+        place = room.put(pack(f"<{count}q", *given))
+
+        def copy() -> None:
+            self._texts = self._copied(room, place, count, sizes[1] if sizes else 0)
+            for number, text in enumerate(self._texts):
+                here[number] = ctypes.addressof(text)
+
+        if "Set" not in name:
+            after.append(copy)
+        return place
+
+    def _copied(self, room: _Room, pointers: int, count: int, sizes: int = 0) -> list[Any]:
+        """Texts or bytes that the FMU has returned; they live until it returns others."""
         first = room.put(b"")
-        size = self._ask(Request.COPY_TEXTS, pointers, count, 0, first, _SIZE // 2)
-        texts = room.taken(first, size).split(b"\0")[:count]
-        return [ctypes.create_string_buffer(text) for text in texts]
+        data = room.taken(first, self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2))
+        if not sizes:
+            return [ctypes.create_string_buffer(text) for text in data.split(b"\0")[:count]]
+        ends = accumulate(size + 1 for size in unpack(f"<{count}Q", room.taken(sizes, 8 * count)))
+        return [ctypes.create_string_buffer(data[start:end]) for start, end in pairwise((0, *ends))]
 
     def _ask(self, what: Request, *arguments: int) -> int:
         """Let the host answer a request; 0 if it has ended."""
