@@ -162,7 +162,12 @@ def test_texts_and_bytes_of_fmi3_pass_as_in_the_native_twin(place: Place, argume
     kinds = ["binary", "binary_array", "string", "string_array", "boolean", "uint8", "float32"]
 
     def run(name: str, fmu: Path) -> bytes:
-        values = {"columns": 2, "binary_in": "AAH/", "binary_array_in": [["AA==", ""], ["/w==", "AAAA"]], "string_in": "ä"}
+        values = {
+            "columns": 2,
+            "binary_in": "AAH/",
+            "binary_array_in": [["AA==", ""], ["/w==", "AAAA"]],
+            "string_in": "ä",
+        }
         content = {
             "mesh": name,
             "simulation": {"stop_time": 0.5, "step_size": 0.1},
@@ -193,7 +198,9 @@ def test_a_result_says_with_which_wine_it_was_computed(place: Place) -> None:
 
     assert place.run("launch", config).wait() == 0
     models = json.loads(notes.read_text(encoding="utf-8"))["models"]
-    notes.write_text(notes.read_text(encoding="utf-8").replace("under Wine (wine-", "under Wine (wine-1"), encoding="utf-8")
+    notes.write_text(
+        notes.read_text(encoding="utf-8").replace("under Wine (wine-", "under Wine (wine-1"), encoding="utf-8"
+    )
     again = place.run("rerun", result)
 
     assert models["pendulum"]["computed_by"].startswith(f"FMI 2.0, under Wine ({wine_version()}")

@@ -155,7 +155,7 @@ class WineLibrary:
         assert process.stdin is not None
         assert process.stdout is not None
         os.set_blocking(process.stdin.fileno(), False)
-        self._table.note(to=process.stdin.fileno(), from_=process.stdout.fileno())
+        self._table.note(to=process.stdin.fileno(), from_=process.stdout.fileno(), process=process.pid)
 
     @property
     def address(self) -> int:
@@ -237,7 +237,7 @@ class WineLibrary:
 
     def _call(self, name: str, there: int, arguments: Sequence[_Argument], values: Sequence[Any]) -> int:
         room, after = _Room(self._memory, self._box.there), list[Callable[[], None]]()
-        places = []
+        places = list[int]()
         for index, (own, value) in enumerate(zip(arguments, values, strict=True)):
             if own.items is fmi2CallbackFunctions:
                 environment = fmi2CallbackFunctions.from_address(value).componentEnvironment or 0
