@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from ....installing import version_of_library
-from ....variables.model_description import Kind
 from ..fmu_library import Argument, absent, arguments_of, count_of
 from ..fmu_values import OK
 
@@ -49,7 +48,7 @@ class ComponentLibrary:
 
     host = None  # as of `FmuLibrary`
 
-    def __init__(self, path: Path, fmpy_class: type[Any], kind: Kind, memory: int | None) -> None:
+    def __init__(self, path: Path, fmpy_class: type[Any], kind: str, memory: int | None) -> None:
         version_of_library("wasmtime")
         import wasmtime.component  # noqa: PLC0415  an optional library
 
@@ -68,9 +67,10 @@ class ComponentLibrary:
         except wasmtime.WasmtimeError as error:
             raise OSError(f"wasmtime cannot compile '{path.name}': {error}") from error
         exports = self._component.type.exports(self._engine)
-        if self._interface not in exports:
+        interface = exports[self._interface].ty if self._interface in exports else None
+        if not isinstance(interface, wasmtime.component.ComponentInstanceType):
             raise OSError(f"'{path.name}' does not export {self._interface}, but {', '.join(exports) or 'nothing'}")
-        self._methods = {name.rpartition(".")[2] for name in exports[self._interface].ty.exports(self._engine)}
+        self._methods = {str(name).rpartition(".")[2] for name in interface.exports(self._engine)}
 
     def close(self) -> None:
         """Free all instances and the component. Never raises; may be called twice."""
