@@ -23,10 +23,10 @@ from ..process_state import FOLDER
 from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls, cffi_function, pointer
+from .component_library import ComponentLibrary
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
 from .step_options import Terms
-from .webassembly.components import ComponentLibrary
 from .wine_library import WineLibrary
 
 __all__ = ["FmuFunctions", "LoadedFmu"]

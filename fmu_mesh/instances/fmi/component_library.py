@@ -21,9 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from ....installing import version_of_library
-from ..fmu_library import Argument, absent, arguments_of, count_of
-from ..fmu_values import OK
+from ...installing import version_of_library
+from .fmu_library import Argument, absent, arguments_of, count_of
+from .fmu_values import OK
 
 __all__ = ["ComponentLibrary"]
 
@@ -61,7 +61,9 @@ class ComponentLibrary:
         self._numbers = itertools.count(1)  # of instances and states, which are pointers for others
         own = kind.replace("_", "-")
         self._interface, self._prefix = _INTERFACE.format(own), f"{own}-instance."
-        self._engine = wasmtime.Engine()
+        config = wasmtime.Config()
+        config.parallel_compilation = False  # its threads would be missing where a process that has them forks
+        self._engine = wasmtime.Engine(config)
         try:
             self._component = wasmtime.component.Component(self._engine, path.read_bytes())
         except wasmtime.WasmtimeError as error:
