@@ -139,13 +139,13 @@ class ComponentLibrary:
         return guest.status("set-fmu-state", self._states[state])
 
     def _free_fmu_state(self, _guest: _Guest, place: int) -> int:
-        own = ctypes.c_size_t.from_address(place)
-        self._states.pop(own.value, None)
-        own.value = 0
+        own = (ctypes.c_size_t * 1).from_address(place)
+        self._states.pop(own[0], None)
+        own[0] = 0
         return OK
 
     def _serialized_fmu_state_size(self, _guest: _Guest, state: int, place: int) -> int:
-        ctypes.c_size_t.from_address(place).value = len(self._states[state])
+        (ctypes.c_size_t * 1).from_address(place)[0] = len(self._states[state])
         return OK
 
     def _serialize_fmu_state(self, _guest: _Guest, state: int, place: int, size: int) -> int:
@@ -157,9 +157,9 @@ class ComponentLibrary:
 
     def _keep(self, place: int, state: bytes) -> int:
         """Keep a state; at ``place`` is the number of the one that it replaces, or 0."""
-        own = ctypes.c_size_t.from_address(place)
-        own.value = own.value or next(self._numbers)
-        self._states[own.value] = state
+        own = (ctypes.c_size_t * 1).from_address(place)
+        own[0] = own[0] or next(self._numbers)
+        self._states[own[0]] = state
         return OK
 
 
@@ -167,7 +167,7 @@ class _Guest:
     """One instance of a component; ``log`` is the function of C for its messages, for an ``environment``."""
 
     def __init__(self, prefix: str, environment: int | None, log: int | None) -> None:
-        self.texts: list[Any] = []  # those that it has returned last
+        self._blocks: list[Any] = []  # what it has returned last
         self._prefix = prefix
         self._environment = environment
         self._log = _LOG(log) if log else None
@@ -226,6 +226,11 @@ class _Guest:
         if isinstance(answer, str):
             raise _Refused(answer)
         return answer
+
+    def kept(self, blocks: Sequence[bytes]) -> list[int]:
+        """Keep copies until the next ones; returns their addresses."""
+        self._blocks = [ctypes.create_string_buffer(one) for one in blocks]
+        return [*map(ctypes.addressof, self._blocks)]
 
     def close(self) -> None:
         """Free it. Never raises."""
@@ -311,15 +316,14 @@ def _give(guest: _Guest, answer: Any, wanted: Sequence[tuple[Argument, int, int]
     for own, place, _ in wanted:
         field = _kebab(own.name)
         value = answer if isinstance(answer, int) else getattr(answer, _FIELDS.get(field, field))
-        own.items.from_address(place).value = value
+        (own.items * 1).from_address(place)[0] = value
 
 
 def _give_list(guest: _Guest, items: Any, place: int, column: Sequence[Any], sizes: int) -> None:  # noqa: ANN401 as above
     """Write a list of WIT to an address; texts and blocks of bytes stay where they are until the next ones."""
     if items is ctypes.c_char_p or items is _BYTES:
         blocks = [one.encode() if isinstance(one, str) else one for one in column]
-        guest.texts = [ctypes.create_string_buffer(one) for one in blocks]
-        (ctypes.c_void_p * len(column)).from_address(place)[:] = [*map(ctypes.addressof, guest.texts)]
+        (ctypes.c_void_p * len(column)).from_address(place)[:] = guest.kept(blocks)
         if sizes:
             (ctypes.c_size_t * len(column)).from_address(sizes)[:] = [*map(len, blocks)]
         return
