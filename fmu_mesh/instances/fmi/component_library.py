@@ -227,8 +227,8 @@ class _Guest:
             raise _Refused(answer)
         return answer
 
-    def kept(self, blocks: Sequence[bytes]) -> list[int]:
-        """Keep copies until the next ones; returns their addresses."""
+    def kept(self, blocks: Sequence[bytes]) -> list[Any]:
+        """Keep copies until the next ones; returns their addresses (int)."""
         self._blocks = [ctypes.create_string_buffer(one) for one in blocks]
         return [*map(ctypes.addressof, self._blocks)]
 
