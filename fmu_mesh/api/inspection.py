@@ -262,7 +262,7 @@ def _kind(description: ModelDescription) -> str:
 
 
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
-_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "yes", "wine": "under Wine"}
+_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "yes", "wine": "under Wine", "wasm": "in WebAssembly"}
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 

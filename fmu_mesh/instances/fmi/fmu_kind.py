@@ -9,7 +9,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from msgspec import Meta
 from msgspec.structs import replace
@@ -34,7 +34,7 @@ from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...rings.library import why_no_library
 from ...system.process_sharing import Claims
-from ...variables.model_description import ModelDescription
+from ...variables.model_description import ModelDescription, Runs
 from ..contract import Instance, Kind, Opening
 from .step_options import NO_STATE_OF_CVODE, SolverName, SolverSettings, StepOptions, Terms
 from .wine import wine_version
@@ -42,6 +42,7 @@ from .wine import wine_version
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
 _DEFAULT_TOLERANCE = 1e-6
+_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "", "wine": ", under Wine", "wasm": ", in WebAssembly"}
 _GUEST_MEMORY = 1 << 30
 """How much memory an FMU in a sandbox of WebAssembly has without `memory`, in bytes."""
 
@@ -173,14 +174,14 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
 
     def summary(self, description: ModelDescription) -> str:
-        """The version of FMI; the solver, or for co-simulation a tolerance that is set; whether it runs under Wine."""
+        """The version of FMI; the solver, or for co-simulation a tolerance that is set; what it runs in."""
         if description.kind == "co_simulation":
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
             settings = self.solver_settings(description)
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
-        return f"FMI {description.fmi_version}{solver}{', under Wine' if description.runs == 'wine' else ''}"
+        return f"FMI {description.fmi_version}{solver}{_RUNS_WORDS[description.runs]}"
 
     def computed_by(self, description: ModelDescription) -> str:
         """See `InstanceSection`; a Windows FMU uses the C library of Wine."""
@@ -265,11 +266,11 @@ class FmuKind(Kind[FmuConfig]):
         return content_of(path)
 
     def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
-        """What its libraries have that a process has only once; nothing of what is compiled or runs under Wine."""
+        """What its libraries have that a process has only once; nothing of what is compiled or another program runs."""
         from .archive.archive import opened  # noqa: PLC0415  as above
         from .archive.library_names import claims_of  # noqa: PLC0415  as above
 
-        if description.library is None or description.runs == "wine":
+        if description.library is None or description.runs != "native":
             return {}
         with opened(path, Terms(limits, section.sha256)) as fmu:
             return claims_of(fmu, description.library)

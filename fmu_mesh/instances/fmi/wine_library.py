@@ -13,7 +13,6 @@ of its arguments are those that FMPy knows. Steps do not come here: `rings/hoste
 from __future__ import annotations
 
 import ctypes
-import inspect
 import mmap
 import os
 import subprocess
@@ -23,8 +22,7 @@ from enum import IntEnum
 from itertools import accumulate, pairwise
 from pathlib import Path
 from struct import pack, unpack
-from types import UnionType
-from typing import Any, Final, NamedTuple, get_args
+from typing import Any, Final
 
 from fmpy.fmi1 import fmi1CallbackFunctions
 from fmpy.fmi2 import fmi2CallbackFunctions
@@ -32,7 +30,7 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 from ...rings import native
 from ...rings.library import host_program
 from ...rings.native import Changed, declared, table
-from .fmu_library import absent
+from .fmu_library import Argument, absent, arguments_of, count_of
 from .fmu_values import FATAL
 from .wine import windows_path, wine_environment, wine_program
 
@@ -47,9 +45,8 @@ _END_S: Final = 5.0
 _WITH_US: Final = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 """A program of Python that becomes another one, which the kernel kills with the thread that has started it."""
 _TEXT: Final = ctypes.c_char_p
+_BYTES: Final = ctypes.POINTER(ctypes.c_ubyte)
 _PLACE: Final = ctypes.c_void_p
-_POINTER: Final[Any] = ctypes.POINTER(ctypes.c_int).__base__
-_FUNCTION: Final[Any] = ctypes.CFUNCTYPE(None).__base__
 
 
 class Request(IntEnum):
@@ -71,28 +68,6 @@ class MailboxTable(Changed):
 @declared("Host")
 class HostTable(Changed):
     """A host."""
-
-
-class _Argument(NamedTuple):
-    """One argument of a function of FMI."""
-
-    name: str
-    type: Any  # of ctypes
-    items: Any  # the type of what it points to; None if it is no pointer
-
-    @classmethod
-    def of(cls, known: inspect.Parameter) -> _Argument:
-        """As FMPy has it."""
-        own = known.annotation
-        type_ = get_args(own)[0] if isinstance(own, UnionType) else own
-        is_pointer = issubclass(type_, _POINTER)
-        return cls(known.name, type_, type_._type_ if is_pointer else None)
-
-    @property
-    def passed(self) -> Any:  # noqa: ANN401 as above
-        """The type of ctypes that our functions get it in."""
-        is_address = self.items is not None or issubclass(self.type, _FUNCTION)
-        return _PLACE if is_address else self.type
 
 
 class _Room:
@@ -213,17 +188,15 @@ class WineLibrary:
 
     def _function(self, name: str, there: int) -> Any:  # noqa: ANN401 as in ctypes
         """A function of C that lets the host call the one at ``there``."""
-        known = inspect.signature(
-            getattr(self._types, name if name.startswith("fmi") else f"fmi1{name.rpartition('_fmi')[2]}")
-        )
-        arguments = [_Argument.of(one) for one in list(known.parameters.values())[1:]]
-        result = {bytes: _PLACE, int: ctypes.c_int}.get(known.return_annotation, known.return_annotation)
+        known = name if name.startswith("fmi") else f"fmi1{name.rpartition('_fmi')[2]}"
+        arguments, returned_type = arguments_of(self._types, known)
+        result = {bytes: _PLACE, int: ctypes.c_int}.get(returned_type, returned_type)
 
         def call(*values: Any) -> Any:  # noqa: ANN401 as in ctypes
             returned = self._call(name, there, arguments, values)
             if result is ctypes.c_int:
                 return FATAL if self._table.ended else ctypes.c_int(returned).value
-            if known.return_annotation is bytes and returned:
+            if returned_type is bytes and returned:
                 room = _Room(self._memory, self._box.there)
                 self._texts = self._copied(room, room.put(pack("<q", returned)), 1)
                 return ctypes.addressof(self._texts[0])
@@ -235,7 +208,7 @@ class WineLibrary:
         self._table.note(functions=self._functions, n_functions=len(self._twins))
         return function
 
-    def _call(self, name: str, there: int, arguments: Sequence[_Argument], values: Sequence[Any]) -> int:
+    def _call(self, name: str, there: int, arguments: Sequence[Argument], values: Sequence[Any]) -> int:
         room, after = _Room(self._memory, self._box.there), list[Callable[[], None]]()
         places = list[int]()
         for index, (own, value) in enumerate(zip(arguments, values, strict=True)):
@@ -251,12 +224,8 @@ class WineLibrary:
             elif own.type is _TEXT:
                 place = room.put(_located(own.name, value) + b"\0")
             elif own.items is not None:
-                count = _count(arguments, values, index)
-                if own.items is _TEXT or issubclass(own.items, _POINTER):
-                    sizes = (values[index - 1], places[-1]) if own.items is not _TEXT else None
-                    place = self._put_texts(room, name, value, count, sizes, after)
-                else:
-                    place = self._put_array(room, name, own, value, count, after)
+                before = values[index - 1], places[-1]  # of bytes, their sizes
+                place = self._put_array(room, name, own, value, count_of(arguments, values, index), before, after)
             elif own.type is ctypes.c_double:
                 (place,) = unpack("<q", pack("<d", value))
             else:
@@ -268,9 +237,18 @@ class WineLibrary:
         return result
 
     def _put_array(  # noqa: PLR0913, PLR0917 an argument, and what becomes of it
-        self, room: _Room, name: str, own: _Argument, address: int, count: int, after: list[Callable[[], None]]
+        self,
+        room: _Room,
+        name: str,
+        own: Argument,
+        address: int,
+        count: int,
+        before: tuple[int, int],
+        after: list[Callable[[], None]],
     ) -> int:
         """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
+        if own.items in {_TEXT, _BYTES}:
+            return self._put_texts(room, name, address, count, None if own.items is _TEXT else before, after)
         size = count * ctypes.sizeof(own.items)
         place = room.put(ctypes.string_at(address, size))
 
@@ -290,7 +268,7 @@ class WineLibrary:
         sizes: tuple[int, int] | None,
         after: list[Callable[[], None]],
     ) -> int:
-        """The same for pointers to texts; with ``sizes``, of this process and of the host, to bytes (FMI 3.0, 2.2.6.2)."""
+        """The same for pointers to texts; with ``sizes``, here and in the host, to bytes (FMI 3.0, 2.2.6.2)."""
         here = (_PLACE * count).from_address(address)
         given = [0] * count
         if "Set" in name:
@@ -324,17 +302,6 @@ class WineLibrary:
         box.arguments[: len(arguments)] = arguments
         assert native.library is not None
         return int(box.result) if native.library.host_ask(self.address) else 0
-
-
-def _count(arguments: Sequence[_Argument], values: Sequence[Any], index: int) -> int:
-    """How many items an argument points to: the next number of that type says it, or else the one before (FMI)."""
-    own = arguments[index]
-    if own.items is _PLACE:  # a state
-        return 1
-    sizes = [place for place, one in enumerate(arguments) if one.type is ctypes.c_size_t]
-    if own.name == "dvUnknown":  # of FMI 2.0, after the known ones
-        return int(values[sizes[0]])
-    return next((int(values[place]) for place in (*(s for s in sizes if s > index), *sizes[::-1])), 1)
 
 
 def _located(name: str, text: bytes) -> bytes:
