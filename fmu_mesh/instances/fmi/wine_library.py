@@ -20,6 +20,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from itertools import accumulate
 from pathlib import Path
 from struct import pack, unpack
 from types import UnionType
@@ -46,6 +47,8 @@ _END_S: Final = 5.0
 _WITH_US: Final = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 """A program of Python that becomes another one, which the kernel kills with the thread that has started it."""
 _TEXT: Final = ctypes.c_char_p
+_BYTES: Final = ctypes.POINTER(ctypes.c_uint8)
+"""A value of type Binary; an argument before those of a call says how long each is (FMI 3.0, 2.2.6.2)."""
 _PLACE: Final = ctypes.c_void_p
 _POINTER: Final[Any] = ctypes.POINTER(ctypes.c_int).__base__
 _FUNCTION: Final[Any] = ctypes.CFUNCTYPE(None).__base__
@@ -250,7 +253,9 @@ class WineLibrary:
             elif own.type is _TEXT:
                 place = room.put(_located(own.name, value) + b"\0")
             elif own.items is not None:
-                place = self._put_array(room, name, own, value, _count(arguments, values, index), after)
+                # The sizes of Binary values are the argument before them, here and in the host.
+                sizes = (values[index - 1], places[-1]) if own.items is _BYTES else (0, 0)
+                place = self._put_array(room, name, own, value, _count(arguments, values, index), sizes, after)
             elif own.type is ctypes.c_double:
                 (place,) = unpack("<q", pack("<d", value))
             else:
@@ -262,18 +267,33 @@ class WineLibrary:
         return result
 
     def _put_array(  # noqa: PLR0913, PLR0917 an argument, and what becomes of it
-        self, room: _Room, name: str, own: _Argument, address: int, count: int, after: list[Callable[[], None]]
+        self,
+        room: _Room,
+        name: str,
+        own: _Argument,
+        address: int,
+        count: int,
+        sizes: tuple[int, int],
+        after: list[Callable[[], None]],
     ) -> int:
-        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
+        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it.
+
+        ``sizes`` are the addresses of the sizes of Binary values, of this process and of the host.
+        """
         is_set = "Set" in name
-        if own.items is _TEXT:
+        if own.items in {_TEXT, _BYTES}:
             here = (_PLACE * count).from_address(address)
-            texts = (_TEXT * count).from_address(address)
-            given = [room.put((text or b"") + b"\0") for text in texts] if is_set else [0] * count
+            given = [0] * count
+            if is_set:
+                lengths = (ctypes.c_size_t * count).from_address(sizes[0]) if sizes[0] else [-1] * count
+                given = [
+                    room.put(ctypes.string_at(text, length) + b"\0") if text else 0
+                    for text, length in zip(here, lengths, strict=True)
+                ]
             place = room.put(pack(f"<{count}q", *given))
 
             def copy() -> None:
-                self._texts = self._copied(room, place, count)
+                self._texts = self._copied(room, place, count, sizes[1])
                 for number, text in enumerate(self._texts):
                     here[number] = ctypes.addressof(text)
 
@@ -288,12 +308,19 @@ class WineLibrary:
             after.append(copy)
         return place
 
-    def _copied(self, room: _Room, pointers: int, count: int) -> list[Any]:
-        """Texts that the FMU has returned; they live until it returns others."""
+    def _copied(self, room: _Room, pointers: int, count: int, sizes: int = 0) -> list[Any]:
+        """Texts that the FMU has returned, or with ``sizes`` bytes; they live until it returns others."""
         first = room.put(b"")
-        size = self._ask(Request.COPY_TEXTS, pointers, count, 0, first, _SIZE // 2)
-        texts = room.taken(first, size).split(b"\0")[:count]
-        return [ctypes.create_string_buffer(text) for text in texts]
+        used = self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2)
+        copied = room.taken(first, used)
+        if not sizes:
+            return [ctypes.create_string_buffer(text) for text in copied.split(b"\0")[:count]]
+        lengths = unpack(f"<{count}Q", room.taken(sizes, count * 8))
+        ends = accumulate(length + 1 for length in lengths)
+        return [
+            ctypes.create_string_buffer(copied[end - length - 1 : end - 1], length + 1)
+            for length, end in zip(lengths, ends, strict=True)
+        ]
 
     def _ask(self, what: Request, *arguments: int) -> int:
         """Let the host answer a request; 0 if it has ended."""
