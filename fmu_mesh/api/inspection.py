@@ -22,7 +22,7 @@ from ..pictures.tables import html_table, pairs, titled
 from ..printing import page, printable
 from ..ssp.configuration_files import names_package, read_configuration
 from ..text import counted, did_you_mean, listed, matching, meant, nearest_file, short_number, shown
-from ..variables.model_description import Causality, Kind, ModelDescription, Runs, Variable
+from ..variables.model_description import Causality, Kind, ModelDescription, Variable
 
 __all__ = [
     "SHOWN_VARIABLES",
@@ -243,7 +243,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
         ("Platforms", platforms or ("none" if description.kinds else "")),
-        ("Runs here", _RUNS_WORDS[description.runs] if inspection.runs_here else "no, see Problems"),
+        ("Runs here", _runs(description) if inspection.runs_here else "no, see Problems"),
         ("Can", ", ".join(can)),
         ("Needs", ", ".join(needs)),
         ("Experiment", ", ".join(times)),
@@ -261,8 +261,13 @@ def _kind(description: ModelDescription) -> str:
     return f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")
 
 
+def _runs(description: ModelDescription) -> str:
+    from ..instances.fmi.wine import wine_version  # noqa: PLC0415  what starts programs is slow to import
+
+    return "yes" if description.runs == "native" else f"under {wine_version()}"
+
+
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
-_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "yes", "wine": "under Wine"}
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 import yaml
 
+import fmu_mesh
+from fmu_mesh.instances.fmi.wine import wine_version
 from tests.equivalence.reference import Pipe, Reference, Table, Unit
 from tests.fmus.event_fmus import Version, build_event_fmu
 from tests.fmus.helpers import FMUS, build_test_fmu, session_folder
@@ -197,5 +200,22 @@ def test_inspect_and_check_say_that_it_runs_under_wine(place: Place) -> None:
     inspected = place.run("inspect", windows_fmu("Gain"))
     checked = place.run("check", mesh_of(place, ["gain"]))
 
-    assert "Runs here    under Wine" in inspected.output
-    assert "gain      Gain.fmu (FMI 2.0, under Wine)" in checked.output
+    assert f"Runs here    under {wine_version()}" in inspected.output
+    assert f"gain      Gain.fmu (FMI 2.0, under {wine_version()})" in checked.output
+
+
+def test_a_rerun_under_another_wine_says_so(place: Place) -> None:
+    config = mesh_of(place, ["gain"])
+    assert place.run("launch", config, "--local", "--stop-time", "0.1").wait() == 0
+    beside = place.folder / "result.csv.json"
+    made = json.loads(beside.read_text(encoding="utf-8"))
+    assert made["models"]["gain"]["computed_by"] == f"FMI 2.0, under {wine_version()}"
+    made["models"]["gain"]["computed_by"] = "FMI 2.0, under Wine 1.0"
+    beside.write_text(json.dumps(made), encoding="utf-8")
+    notices: list[str] = []
+
+    again = fmu_mesh.rerun(place.folder / "result.csv", on_notice=notices.append)
+
+    (notice,) = notices
+    assert f"'gain' by 'FMI 2.0, under Wine 1.0', and here by 'FMI 2.0, under {wine_version()}'" in notice
+    assert fmu_mesh.Result.read(place.folder / "result.csv").compare(again).equal

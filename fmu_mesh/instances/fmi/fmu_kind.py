@@ -172,14 +172,19 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
 
     def summary(self, description: ModelDescription) -> str:
-        """The version of FMI; the solver, or for co-simulation a tolerance that is set; whether it runs under Wine."""
+        """The version of FMI; the solver, or for co-simulation a tolerance that is set; which Wine runs it."""
         if description.kind == "co_simulation":
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
             settings = self.solver_settings(description)
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
-        return f"FMI {description.fmi_version}{solver}{', under Wine' if description.runs == 'wine' else ''}"
+        words = f"FMI {description.fmi_version}{solver}"
+        if description.runs == "native":
+            return words
+        from .wine import wine_version  # noqa: PLC0415  what starts programs is slow to import
+
+        return f"{words}, under {wine_version()}"
 
     def other_kind(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""

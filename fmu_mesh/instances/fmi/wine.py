@@ -28,7 +28,7 @@ from typing import Final
 from ... import files
 from ...errors import LoadFailed
 
-__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program"]
+__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program", "wine_version"]
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +78,16 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
                 hint="Set FMU_MESH_CACHE_DIR to a folder that can be written.",
             ) from error
     return _environment(prefix, _OVERRIDES + _NO_SESSION)
+
+
+def wine_version() -> str:
+    """Wine and its version, for people and for the metadata of results: `Wine 8.0`; `Wine` where there is none.
+
+    Raises:
+        LoadFailed: the program that is installed does not tell it.
+    """
+    program = wine_program()
+    return "Wine" if program is None else f"Wine {_version(program).removeprefix('wine-').split()[0]}"
 
 
 def windows_path(path: Path) -> str:
