@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ctypes
 import inspect
+import logging
 import mmap
 import os
 import subprocess
@@ -37,6 +38,8 @@ from .fmu_values import FATAL
 from .wine import windows_path, wine_environment, wine_program
 
 __all__ = ["Request", "WineLibrary"]
+
+log = logging.getLogger(__name__)
 
 _SIZE: Final = 1 << 30
 """Of the memory, in bytes; what is not used takes no space."""
@@ -222,7 +225,11 @@ class WineLibrary:
         result = {bytes: _PLACE, int: ctypes.c_int}.get(known.return_annotation, known.return_annotation)
 
         def call(*values: Any) -> Any:  # noqa: ANN401 as in ctypes
-            returned = self._call(name, there, arguments, values)
+            try:
+                returned = self._call(name, there, arguments, values)
+            except MemoryError as error:  # ctypes would return 0, which is OK
+                log.error("%s: %s: %s", self._name.value.decode(), name, error)
+                return FATAL if result is ctypes.c_int else None
             if result is ctypes.c_int:
                 return FATAL if self._table.ended else ctypes.c_int(returned).value
             if known.return_annotation is bytes and returned:
@@ -239,7 +246,7 @@ class WineLibrary:
 
     def _call(self, name: str, there: int, arguments: Sequence[_Argument], values: Sequence[Any]) -> int:
         room, after = _Room(self._memory, self._box.there), list[Callable[[], None]]()
-        places = []
+        places: list[int] = []
         for index, (own, value) in enumerate(zip(arguments, values, strict=True)):
             if own.items is fmi2CallbackFunctions:
                 environment = fmi2CallbackFunctions.from_address(value).componentEnvironment or 0
@@ -312,6 +319,8 @@ class WineLibrary:
         """Texts that the FMU has returned, or with ``sizes`` bytes; they live until it returns others."""
         first = room.put(b"")
         used = self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2)
+        if used > _SIZE // 2:
+            raise MemoryError(f"values of an FMU under Wine have more than {_SIZE // 2:,} bytes")
         copied = room.taken(first, used)
         if not sizes:
             return [ctypes.create_string_buffer(text) for text in copied.split(b"\0")[:count]]
