@@ -228,7 +228,7 @@ class WineLibrary:
             try:
                 returned = self._call(name, there, arguments, values)
             except MemoryError as error:  # ctypes would return 0, which is OK
-                log.error("%s: %s: %s", self._name.value.decode(), name, error)
+                log.error("%s: %s: %s", self._name.value.decode(), name, error)  # noqa: TRY400  a traceback helps no user
                 return FATAL if result is ctypes.c_int else None
             if result is ctypes.c_int:
                 return FATAL if self._table.ended else ctypes.c_int(returned).value
