@@ -317,10 +317,6 @@ class InstanceSection:
         """In a few words what computes the model, for the page of `fmu-mesh check`."""
         return description.generation_tool or key_of(self)
 
-    def computed_by(self, description: ModelDescription) -> str:
-        """`summary`, with the version of what computes it where other versions may give other floats."""
-        return self.summary(description)
-
     def other_kind(self, description: ModelDescription) -> str | None:  # noqa: ARG002  for kinds with a choice
         """What else the model could be used as, as the end of a sentence; None without a choice, or once it is made."""
         return None

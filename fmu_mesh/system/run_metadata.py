@@ -163,7 +163,7 @@ def metadata_of(
                 own.fmu,
                 contents.get(name, ""),
                 own.description.guid,
-                loaded.config.instances[name].computed_by(own.description),
+                loaded.config.instances[name].summary(own.description),
             )
             for name, own in system.instances.items()
         },

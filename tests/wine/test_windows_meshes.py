@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import Any
 import pytest
 import yaml
 
+import fmu_mesh
 from fmu_mesh.instances.fmi.wine import wine_version
 from tests.equivalence.reference import Pipe, Reference, Table, Unit
 from tests.fmus.event_fmus import Version, build_event_fmu
-from tests.fmus.helpers import FMUS, find_fmu, session_folder
+from tests.fmus.helpers import FMUS, build_test_fmu, session_folder
 from tests.helpers import BY_STREAMS, Place, rows_of, write_config
 from tests.wine.windows import NEEDS_WINE, run_dlls, windows_event_fmu, windows_fmu
 
@@ -157,61 +159,63 @@ def test_all_versions_and_kinds_give_the_floats_of_their_native_twins(
 
 
 @pytest.mark.parametrize("arguments", [(), ("--local",)], ids=["distributed", "local"])
-def test_texts_and_bytes_of_fmi3_pass_as_in_the_native_twin(place: Place, arguments: Sequence[str]) -> None:
-    """Of two instances in a row: what a getter returns, and what a setter takes."""
-    kinds = ["binary", "binary_array", "string", "string_array", "boolean", "uint8", "float32"]
+def test_bytes_texts_and_arrays_of_both_go_through(place: Place, arguments: tuple[str, ...]) -> None:
+    """Binary values have zeros in them, are empty, and change their sizes from point to point."""
+    data = [base64.b64encode(value).decode() for value in (b"", b"\0", b"a\0\0b", bytes(range(256)), b"\xff" * 99_999)]
+    texts = ["", "a", "ü b", "c" * 70_000]
+    times = {"times": [0.01 * point for point in range(1, 6)]}
+    values = {
+        "a.binary_in": times | {"values": data},
+        "a.binary_array_in": times | {"values": [[data[n : n + 2], data[3 - n : 5 - n]] for n in (0, 1, 2, 3, 0)]},
+        "a.string_in": times | {"values": [*texts, texts[1]]},
+        "a.string_array_in": times | {"values": [[texts[n : n + 2], texts[1 - n : 3 - n]] for n in (0, 1, 0, 1, 0)]},
+    }
+    outputs = [name.removeprefix("a.").replace("_in", "_out") for name in values]
 
     def run(name: str, fmu: Path) -> bytes:
-        values = {
-            "columns": 2,
-            "binary_in": "AAH/",
-            "binary_array_in": [["AA==", ""], ["/w==", "AAAA"]],
-            "string_in": "ä",
-        }
-        content = {
-            "mesh": name,
-            "simulation": {"stop_time": 0.5, "step_size": 0.1},
-            "instances": {
-                "first": {"fmu": str(fmu), "start_values": values},
-                "second": {"fmu": str(fmu), "start_values": {"columns": 2}},
+        config = write_config(
+            place.folder,
+            instances={
+                one: {"fmu": str(fmu), "start_values": {"columns": 2, "binary_parameter": data[3]}} for one in "ab"
             },
-            "connections": [f"first.{kind}_out -> second.{kind}_in" for kind in kinds],
-            "record": {"file": f"{name}.csv", "variables": [f"second.{kind}_out" for kind in kinds]},
-        }
-        config = place.folder / f"{name}.yaml"
-        config.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+            connections=[f"a.{output} -> b.{output.replace('_out', '_in')}" for output in outputs],
+            name=name,
+            stop_time=0.08,
+            simulation={"step_size": 0.01},
+            scenario={"values": values},
+            record={"file": f"{name}.csv", "variables": [f"{one}.{output}" for one in "ab" for output in outputs]},
+        )
         launched = place.run("launch", config, *arguments)
         assert launched.wait() == 0, launched.errors
-        return (place.folder / f"{name}.csv").read_bytes()
+        return config.with_suffix(".csv").read_bytes()
 
     windows = run("windows", windows_fmu("AllTypes3"))
 
-    assert b"AAH/" in windows
-    assert windows == run("native", find_fmu("AllTypes3", place.folder))
+    assert windows == run("native", build_test_fmu("AllTypes3", place.folder))
+    assert base64.b64encode(b"\xff" * 99_999) in windows
     place.assert_nothing_left(within_s=5.0)
-
-
-def test_a_result_says_with_which_wine_it_was_computed(place: Place) -> None:
-    config = mesh_of(place, ["pendulum"])
-    result = place.folder / "result.csv"
-    notes = place.folder / "result.csv.json"
-
-    assert place.run("launch", config).wait() == 0
-    models = json.loads(notes.read_text(encoding="utf-8"))["models"]
-    notes.write_text(
-        notes.read_text(encoding="utf-8").replace("under Wine (wine-", "under Wine (wine-1"), encoding="utf-8"
-    )
-    again = place.run("rerun", result)
-
-    assert models["pendulum"]["computed_by"].startswith(f"FMI 2.0, under Wine ({wine_version()}")
-    assert models["delay"]["computed_by"] == "FMI 2.0"
-    assert again.wait() == 0, again.errors
-    assert "'pendulum' was computed by FMI 2.0, under Wine (wine-1" in again.errors
 
 
 def test_inspect_and_check_say_that_it_runs_under_wine(place: Place) -> None:
     inspected = place.run("inspect", windows_fmu("Gain"))
     checked = place.run("check", mesh_of(place, ["gain"]))
 
-    assert "Runs here    under Wine" in inspected.output
-    assert "gain      Gain.fmu (FMI 2.0, under Wine)" in checked.output
+    assert f"Runs here    under {wine_version()}" in inspected.output
+    assert f"gain      Gain.fmu (FMI 2.0, under {wine_version()})" in checked.output
+
+
+def test_a_rerun_under_another_wine_says_so(place: Place) -> None:
+    config = mesh_of(place, ["gain"])
+    assert place.run("launch", config, "--local", "--stop-time", "0.1").wait() == 0
+    beside = place.folder / "result.csv.json"
+    made = json.loads(beside.read_text(encoding="utf-8"))
+    assert made["models"]["gain"]["computed_by"] == f"FMI 2.0, under {wine_version()}"
+    made["models"]["gain"]["computed_by"] = "FMI 2.0, under Wine 1.0"
+    beside.write_text(json.dumps(made), encoding="utf-8")
+    notices: list[str] = []
+
+    again = fmu_mesh.rerun(place.folder / "result.csv", on_notice=notices.append)
+
+    (notice,) = notices
+    assert f"'gain' by 'FMI 2.0, under Wine 1.0', and here by 'FMI 2.0, under {wine_version()}'" in notice
+    assert fmu_mesh.Result.read(place.folder / "result.csv").compare(again).equal

@@ -9,7 +9,7 @@ import math
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from msgspec import Meta
 from msgspec.structs import replace
@@ -34,15 +34,13 @@ from ...config.mesh import LimitsConfig
 from ...errors import LoadFailed
 from ...rings.library import why_no_library
 from ...system.process_sharing import Claims
-from ...variables.model_description import ModelDescription, Runs
+from ...variables.model_description import ModelDescription
 from ..contract import Instance, Kind, Opening
 from .step_options import NO_STATE_OF_CVODE, SolverName, SolverSettings, StepOptions, Terms
-from .wine import wine_version
 
 __all__ = ["KIND_OF_FMUS", "FmuConfig", "SolverConfig"]
 
 _DEFAULT_TOLERANCE = 1e-6
-_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "", "wine": ", under Wine", "wasm": ", in WebAssembly"}
 _GUEST_MEMORY = 1 << 30
 """How much memory an FMU in a sandbox of WebAssembly has without `memory`, in bytes."""
 
@@ -181,12 +179,7 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             settings = self.solver_settings(description)
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
-        return f"FMI {description.fmi_version}{solver}{_RUNS_WORDS[description.runs]}"
-
-    def computed_by(self, description: ModelDescription) -> str:
-        """See `InstanceSection`; a Windows FMU uses the C library of Wine."""
-        version = f" ({wine_version()})" if description.runs == "wine" else ""
-        return f"{self.summary(description)}{version}"
+        return f"FMI {description.fmi_version}{solver}{_runs(description)}"
 
     def other_kind(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""
@@ -332,3 +325,11 @@ def _cannot_retry(description: ModelDescription) -> str | None:
     if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
         return "the FMU cannot get and set its state, so it cannot go back to where the step began"
     return None
+
+
+def _runs(description: ModelDescription) -> str:
+    if description.runs == "wine":
+        from .wine import wine_version  # noqa: PLC0415  what starts programs is slow to import
+
+        return f", under {wine_version()}"
+    return ", in WebAssembly" if description.runs == "wasm" else ""

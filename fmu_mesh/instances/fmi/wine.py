@@ -63,7 +63,7 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
     """
     if (program := wine_program()) is None:
         raise LoadFailed("Wine, which runs Windows FMUs, is not installed.", hint=f"{INSTALL_WINE}.")
-    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", wine_version()).strip("-")
+    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", _version()).strip("-")
     if not prefix.is_dir():
         try:
             prefix.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -81,6 +81,15 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
     return _environment(prefix, _OVERRIDES + _NO_SESSION)
 
 
+def wine_version() -> str:
+    """Wine and its version, for people and for the metadata of results: `Wine 8.0`; `Wine` where there is none.
+
+    Raises:
+        LoadFailed: the program that is installed does not tell it.
+    """
+    return "Wine" if wine_program() is None else f"Wine {_version().removeprefix('wine-').split()[0]}"
+
+
 def windows_path(path: Path) -> str:
     r"""The path as Windows code under Wine sees it: `/tmp/a` is `Z:\tmp\a`."""
     return str(PureWindowsPath(f"Z:{path.absolute()}"))
@@ -92,7 +101,7 @@ def windows_uri(path: Path) -> str:
 
 
 @functools.cache
-def wine_version() -> str:
+def _version() -> str:
     """The version in Wine's own words: `wine-8.0 (Debian 8.0~repack-4)`."""
     program = wine_program() or "wine"
     try:

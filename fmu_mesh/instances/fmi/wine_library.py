@@ -13,13 +13,14 @@ of its arguments are those that FMPy knows. Steps do not come here: `rings/hoste
 from __future__ import annotations
 
 import ctypes
+import logging
 import mmap
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from enum import IntEnum
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from pathlib import Path
 from struct import pack, unpack
 from typing import Any, Final
@@ -36,6 +37,8 @@ from .wine import windows_path, wine_environment, wine_program
 
 __all__ = ["Request", "WineLibrary"]
 
+log = logging.getLogger(__name__)
+
 _SIZE: Final = 1 << 30
 """Of the memory, in bytes; what is not used takes no space."""
 _ROOM: Final = 131072
@@ -45,7 +48,8 @@ _END_S: Final = 5.0
 _WITH_US: Final = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 """A program of Python that becomes another one, which the kernel kills with the thread that has started it."""
 _TEXT: Final = ctypes.c_char_p
-_BYTES: Final = ctypes.POINTER(ctypes.c_ubyte)
+_BYTES: Final = ctypes.POINTER(ctypes.c_uint8)
+"""A value of type Binary; an argument before those of a call says how long each is (FMI 3.0, 2.2.6.2)."""
 _PLACE: Final = ctypes.c_void_p
 
 
@@ -193,7 +197,11 @@ class WineLibrary:
         result = {bytes: _PLACE, int: ctypes.c_int}.get(returned_type, returned_type)
 
         def call(*values: Any) -> Any:  # noqa: ANN401 as in ctypes
-            returned = self._call(name, there, arguments, values)
+            try:
+                returned = self._call(name, there, arguments, values)
+            except MemoryError as error:  # ctypes would return 0, which is OK
+                log.error("%s: %s: %s", self._name.value.decode(), name, error)  # noqa: TRY400  a traceback helps no user
+                return FATAL if result is ctypes.c_int else None
             if result is ctypes.c_int:
                 return FATAL if self._table.ended else ctypes.c_int(returned).value
             if returned_type is bytes and returned:
@@ -210,7 +218,7 @@ class WineLibrary:
 
     def _call(self, name: str, there: int, arguments: Sequence[Argument], values: Sequence[Any]) -> int:
         room, after = _Room(self._memory, self._box.there), list[Callable[[], None]]()
-        places = list[int]()
+        places: list[int] = []
         for index, (own, value) in enumerate(zip(arguments, values, strict=True)):
             if own.items is fmi2CallbackFunctions:
                 environment = fmi2CallbackFunctions.from_address(value).componentEnvironment or 0
@@ -224,8 +232,9 @@ class WineLibrary:
             elif own.type is _TEXT:
                 place = room.put(_located(own.name, value) + b"\0")
             elif own.items is not None:
-                before = values[index - 1], places[-1]  # of bytes, their sizes
-                place = self._put_array(room, name, own, value, count_of(arguments, values, index), before, after)
+                # The sizes of Binary values are the argument before them, here and in the host.
+                sizes = (values[index - 1], places[-1]) if own.items is _BYTES else (0, 0)
+                place = self._put_array(room, name, own, value, count_of(arguments, values, index), sizes, after)
             elif own.type is ctypes.c_double:
                 (place,) = unpack("<q", pack("<d", value))
             else:
@@ -243,57 +252,56 @@ class WineLibrary:
         own: Argument,
         address: int,
         count: int,
-        before: tuple[int, int],
+        sizes: tuple[int, int],
         after: list[Callable[[], None]],
     ) -> int:
-        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
+        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it.
+
+        ``sizes`` are the addresses of the sizes of Binary values, of this process and of the host.
+        """
+        is_set = "Set" in name
         if own.items in {_TEXT, _BYTES}:
-            return self._put_texts(room, name, address, count, None if own.items is _TEXT else before, after)
-        size = count * ctypes.sizeof(own.items)
-        place = room.put(ctypes.string_at(address, size))
+            here = (_PLACE * count).from_address(address)
+            given = [0] * count
+            if is_set:
+                lengths = (ctypes.c_size_t * count).from_address(sizes[0]) if sizes[0] else [-1] * count
+                given = [
+                    room.put(ctypes.string_at(text, length) + b"\0") if text else 0
+                    for text, length in zip(here, lengths, strict=True)
+                ]
+            place = room.put(pack(f"<{count}q", *given))
 
-        def copy() -> None:
-            ctypes.memmove(address, room.taken(place, size), size)
+            def copy() -> None:
+                self._texts = self._copied(room, place, count, sizes[1])
+                for number, text in enumerate(self._texts):
+                    here[number] = ctypes.addressof(text)
 
-        if "Set" not in name:
-            after.append(copy)
-        return place
+        else:
+            size = count * ctypes.sizeof(own.items)
+            place = room.put(ctypes.string_at(address, size))
 
-    def _put_texts(  # noqa: PLR0913, PLR0917 as above
-        self,
-        room: _Room,
-        name: str,
-        address: int,
-        count: int,
-        sizes: tuple[int, int] | None,
-        after: list[Callable[[], None]],
-    ) -> int:
-        """The same for pointers to texts; with ``sizes``, here and in the host, to bytes (FMI 3.0, 2.2.6.2)."""
-        here = (_PLACE * count).from_address(address)
-        given = [0] * count
-        if "Set" in name:
-            own = (ctypes.c_size_t * count).from_address(sizes[0]) if sizes else [-1] * count
-            data = [ctypes.string_at(one, size) if one else b"" for one, size in zip(here, own, strict=True)]
-            given = [room.put(one + b"\0") for one in data]
-        place = room.put(pack(f"<{count}q", *given))
+            def copy() -> None:
+                ctypes.memmove(address, room.taken(place, size), size)
 
-        def copy() -> None:
-            self._texts = self._copied(room, place, count, sizes[1] if sizes else 0)
-            for number, text in enumerate(self._texts):
-                here[number] = ctypes.addressof(text)
-
-        if "Set" not in name:
+        if not is_set:
             after.append(copy)
         return place
 
     def _copied(self, room: _Room, pointers: int, count: int, sizes: int = 0) -> list[Any]:
-        """Texts or bytes that the FMU has returned; they live until it returns others."""
+        """Texts that the FMU has returned, or with ``sizes`` bytes; they live until it returns others."""
         first = room.put(b"")
-        data = room.taken(first, self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2))
+        used = self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2)
+        if used > _SIZE // 2:
+            raise MemoryError(f"values of an FMU under Wine have more than {_SIZE // 2:,} bytes")
+        copied = room.taken(first, used)
         if not sizes:
-            return [ctypes.create_string_buffer(text) for text in data.split(b"\0")[:count]]
-        ends = accumulate(size + 1 for size in unpack(f"<{count}Q", room.taken(sizes, 8 * count)))
-        return [ctypes.create_string_buffer(data[start:end]) for start, end in pairwise((0, *ends))]
+            return [ctypes.create_string_buffer(text) for text in copied.split(b"\0")[:count]]
+        lengths = unpack(f"<{count}Q", room.taken(sizes, count * 8))
+        ends = accumulate(length + 1 for length in lengths)
+        return [
+            ctypes.create_string_buffer(copied[end - length - 1 : end - 1], length + 1)
+            for length, end in zip(lengths, ends, strict=True)
+        ]
 
     def _ask(self, what: Request, *arguments: int) -> int:
         """Let the host answer a request; 0 if it has ended."""
