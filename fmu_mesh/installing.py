@@ -51,7 +51,7 @@ PROGRAMS: Final[Mapping[str, tuple[str, str]]] = {
         "Install the programs of Slurm (Debian, Ubuntu: apt install slurm-client), or run this on a login host.",
     ),
     "ssh": ("nodes on other hosts", "Install it, on Debian with `apt install openssh-client`."),
-    "wine": ("FMUs that have only Windows binaries", "Install it, on Debian with `apt install wine64`."),
+    "wine": ("FMUs that have only Windows binaries", "Install it, on Debian with `apt install wine`."),
     "zenoh-bridge-ros2dds": ("meshes beside ROS on DDS", "Start it where ROS is; `ros.connect` says where that is."),
 }
 """Programs of the system: what needs each, a plural, and what to do without it."""

@@ -115,4 +115,4 @@ def test_without_wine_the_error_names_the_package(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(LoadFailed, match="is not installed") as refused:
         wine_environment()
 
-    assert refused.value.hint == "`apt install wine64` lets it run under Wine."
+    assert refused.value.hint == "`apt install wine` lets it run under Wine."

@@ -196,6 +196,15 @@ def test_bytes_texts_and_arrays_of_both_go_through(place: Place, arguments: tupl
     place.assert_nothing_left(within_s=5.0)
 
 
+@pytest.mark.parametrize("name", ["AllTypes1", "Steps1"])
+def test_co_simulation_of_fmi1_gives_the_values_of_its_twin(tmp_path: Path, name: str) -> None:
+    windows = fmu_mesh.simulate(windows_fmu(name), stop_time=1.0, step_size=0.1)
+    native = fmu_mesh.simulate(build_test_fmu(name, tmp_path), stop_time=1.0, step_size=0.1)
+
+    assert {name: windows[name].tolist() for name in windows} == {name: native[name].tolist() for name in native}
+    assert len(native.times) == 11
+
+
 def test_inspect_and_check_say_that_it_runs_under_wine(place: Place) -> None:
     inspected = place.run("inspect", windows_fmu("Gain"))
     checked = place.run("check", mesh_of(place, ["gain"]))

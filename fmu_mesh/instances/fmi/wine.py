@@ -33,7 +33,7 @@ __all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "w
 
 log = logging.getLogger(__name__)
 
-INSTALL_WINE: Final = "`apt install wine64` lets it run under Wine"
+INSTALL_WINE: Final = "`apt install wine` lets it run under Wine"
 """What to do about an FMU that has only binaries for Windows."""
 
 _PREPARE_S: Final = 300.0
@@ -145,7 +145,8 @@ def _wait_for(lock: int, prefix: Path) -> None:
 def _make(program: Path, prefix: Path) -> None:
     """Make the prefix under another name, and rename it at the end."""
     draft = prefix.with_name(f"{prefix.name}.{os.getpid()}.draft")
-    server = shutil.which("wineserver")
+    if (server := shutil.which("wineserver")) is None:
+        raise LoadFailed("'wineserver', which belongs to Wine, is not on the PATH.", hint=f"{INSTALL_WINE}.")
 
     def run(*command: str) -> str:
         # Wine's services inherit the output, so the end of a pipe would be that of all of them.
@@ -163,16 +164,14 @@ def _make(program: Path, prefix: Path) -> None:
             return output.read().decode(errors="replace")
 
     for left in prefix.parent.glob(f"{prefix.name}.*.draft"):
-        if server:
-            subprocess.run(
-                [server, "--kill"], env=_environment(left, _OVERRIDES), capture_output=True, check=False, timeout=60
-            )
+        subprocess.run(
+            [server, "--kill"], env=_environment(left, _OVERRIDES), capture_output=True, check=False, timeout=_PREPARE_S
+        )
         shutil.rmtree(left, ignore_errors=True)
     draft.mkdir(mode=0o700)
     said = run(str(program), "wineboot", "--init")
     variables = run(str(program), "cmd", "/c", "set")
-    if server:
-        run(server, "--wait")  # it writes the registry at its end
+    run(server, "--wait")  # it writes the registry at its end
     if not (draft / "system.reg").is_file():
         raise LoadFailed(f"Wine cannot make a prefix; it says: {said.strip()[-500:] or 'nothing'}")
     if found := re.search(r"WINEDLLDIR0=.*?[Zz]:(\\.*?)\s*\n", variables):
