@@ -361,6 +361,10 @@ class RunReset(Interrupted):
     """A command has reset the mesh: this run ends at `point`, and the same processes begin the next one."""
 
 
+class StepPending(Exception):  # noqa: N818 it is none of our errors, and nobody outside sees it
+    """A step that waits for a program is not done yet: the engine leaves, and takes the same step again."""
+
+
 class TerminationRequested(FmuMeshError):
     """An FMU asked to end the simulation during the step from `point` (FMI 2.0, 4.2.3; FMI 3.0, 4.2.1).
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Self
 
 import msgspec
@@ -56,13 +57,13 @@ class Deadlines(msgspec.Struct, frozen=True, kw_only=True):
     leave_interrupted: float = 0.3
 
     @classmethod
-    def of(cls, timeouts: TimeoutsConfig, most_instances: int = 1) -> Self:
-        """The deadlines of a mesh whose largest node has so many instances."""
+    def of(cls, timeouts: TimeoutsConfig, most_instances: int = 1, *, waits_for_program: bool = False) -> Self:
+        """The deadlines of a mesh whose largest node has so many instances; one may wait for a program of the user."""
         return cls(
             start=timeouts.start,
             initialize=timeouts.initialize,
             step=timeouts.step,
-            silence=3 * timeouts.step * most_instances,
+            silence=math.inf if waits_for_program else 3 * timeouts.step * most_instances,
             stop=timeouts.stop + timeouts.terminate * most_instances,
             heartbeat=max(0.01, min(0.5, timeouts.step / 4)),
             link=timeouts.link,

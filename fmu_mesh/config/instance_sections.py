@@ -253,6 +253,7 @@ class InstanceSection:
         follows_fmi: whether the rules of FMI apply to the model. If so, a start value that FMI forbids is a warning, or
             an error where the configuration is strict; otherwise it is always an error.
         names_code: whether it names code of the user, which whoever reads the configuration runs.
+        waits_for_program: whether its steps wait for a program of the user, without a deadline.
         interpreter: the Python that has to run the instance; None: the one that runs fmu-mesh.
     """
 
@@ -272,6 +273,7 @@ class InstanceSection:
     strict: bool | None = None
     follows_fmi: ClassVar[bool] = False
     names_code: ClassVar[bool] = False
+    waits_for_program: ClassVar[bool] = False
     interpreter: str | None = None
 
     @property

@@ -321,6 +321,8 @@ class Guarded(AroundNativeSteps):
         self._trusted = is_harmless
         self._is_watched = not isinstance(watch, Unwatched)
         super().__init__(self._made(LoadFailed, "call", open_))
+        if self.waits_for_program:
+            self._is_watched = False
         self._again = self._instance if isinstance(self._instance, BeginsAgain) else None
         if isinstance(self._instance, ChangesProcess) and self._instance.changes_process:
             self._careful = True

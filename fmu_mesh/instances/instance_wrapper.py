@@ -103,6 +103,16 @@ class AroundInstance(Generic[Within]):
         inner: object = self._instance
         return inner.failed if isinstance(inner, AroundInstance) else ""
 
+    @property
+    def waits_for_program(self) -> bool:
+        """Whether it waits for a program of the user, and has deadlines of its own."""
+        return bool(getattr(self._instance, "waits_for_program", False))
+
+    @property
+    def awaited(self) -> str:
+        """For which program of the user its step waits, and since when, in words; empty: it does not wait."""
+        return str(getattr(self._instance, "awaited", ""))
+
     def take_care(self) -> None:
         """From the next step on, undo after each step what it does to the state of the process."""
         if isinstance(self._instance, AroundInstance):

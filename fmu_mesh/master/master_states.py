@@ -96,7 +96,9 @@ class MasterStates:
         self.plan = plan
         self.state: MeshState = "starting"
         self.deadlines = Deadlines.of(
-            plan.system.config.timeouts, max(len(node.instances) for node in plan.nodes.values())
+            plan.system.config.timeouts,
+            max(len(node.instances) for node in plan.nodes.values()),
+            waits_for_program=any(own.section.waits_for_program for n in plan.nodes.values() for own in n.instances),
         )
         self.registrations = Registrations(plan)
         self.granting = Granting(plan)

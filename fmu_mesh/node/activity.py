@@ -113,7 +113,7 @@ class Activity:
         watched by `fmu_mesh.instances.call_guard.CallWatch`.
         """
         engine, now = self._engine, self._clock()
-        if engine is None or self.state != "running" or (runner := engine.current) is None:
+        if engine is None or self.state != "running" or (runner := engine.current) is None or runner.awaited:
             self._under_way = None
             return None
         under_way_s = now - self._since(runner, now)
@@ -166,6 +166,8 @@ class Activity:
         if late:
             without = (f"no value for '{name}' since point {point}" for name, point in late.items())
             return "; ".join((self._in_words(runner, {}), *without))
+        if awaited := runner.awaited:
+            return f"waiting at point {runner.point} for {awaited}"
         current = self._engine.current if self._engine is not None else None
         if current is None:
             cut = self._keeper.cut_in_words(self._plan.node) if self._keeper is not None else ()

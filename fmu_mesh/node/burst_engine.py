@@ -5,12 +5,13 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from itertools import chain
 from time import perf_counter
 from typing import Final, cast
 
-from ..errors import FmuMeshError, ProtocolBroken, TerminationRequested
+from ..errors import FmuMeshError, ProtocolBroken, StepPending, TerminationRequested
 from ..instances.contract import StepsNatively
 from ..instances.process_state import ProcessState, floating_point_changed, restore_floating_point
 from ..rings import native
@@ -98,7 +99,11 @@ class BurstEngine(Engine):
         node.wait_ns, node.eager, node.quiet_ns = int(wait_s * 1e9), eager, int(most_s * 1e9) if quiet else 0
         started, before, waited_ns = perf_counter(), self._ticks, node.waited_ns
         while (result := self._run(None, most_s)) >= BurstEnd.PYTHON:
-            self.complete(result)
+            try:
+                self.complete(result)
+            except StepPending:  # the node looks at what else there is, and calls again
+                result = BurstEnd.BLOCKED
+                break
             if perf_counter() - started > most_s:
                 library.attend(self._address)  # so it returns after this tick
         library.attended(self._address)
@@ -128,6 +133,9 @@ class BurstEngine(Engine):
                 self._by_python[runner.name](member.step)
             else:
                 self._complete(runner, result)
+        except StepPending:
+            member.stage = Stage.WAITING
+            raise
         except FmuMeshError as error:
             self._failed(asks_to_end=isinstance(error, TerminationRequested)).is_finite.explain(error)
             raise
@@ -163,7 +171,8 @@ class BurstEngine(Engine):
             if end == BurstEnd.ATTENTION:
                 self._library.attended(self._address)
                 return
-            self.complete(end)
+            with suppress(StepPending):
+                self.complete(end)
 
     def send(self) -> None:
         """See `Engine`."""

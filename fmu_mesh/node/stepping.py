@@ -232,6 +232,11 @@ class Runner:
         """In words since when and why its outputs are held; empty: they are not."""
         return self.instance.failed if isinstance(self.instance, AroundInstance) else ""
 
+    @property
+    def awaited(self) -> str:
+        """For which program of the user its step waits, and since when, in words; empty: it does not wait."""
+        return self.instance.awaited if isinstance(self.instance, AroundInstance) else ""
+
     def play(self, player: RowPlayer | None) -> None:
         """Let its rows be played from the next step on; with None, the instance takes its steps."""
         self.player = player

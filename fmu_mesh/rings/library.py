@@ -13,7 +13,7 @@ import os
 import platform
 import re
 import sys
-from ctypes import CFUNCTYPE, PYFUNCTYPE, c_double, c_int64, c_uint32, c_void_p
+from ctypes import CFUNCTYPE, PYFUNCTYPE, c_char_p, c_double, c_int, c_int64, c_size_t, c_uint32, c_void_p
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -61,6 +61,12 @@ class LibraryFunctions:
         self.member_step = CFUNCTYPE(c_int64, address, c_int64)(("member_step", slow))
         self.member_is_finite = PYFUNCTYPE(c_int64, address, c_int64)(("member_is_finite", quick))
         self.host_ask = CFUNCTYPE(c_int64, address)(("host_ask", slow))
+        self.outside_put = CFUNCTYPE(c_int, address, address, c_size_t, address)(("outside_put", quick))
+        self.outside_take = CFUNCTYPE(c_int, address, address, c_size_t, address)(("outside_take", quick))
+        self.outside_do_step = CFUNCTYPE(c_int, address, c_double, c_double, c_int)(("outside_do_step", slow))
+        self.outside_await = CFUNCTYPE(c_int, address)(("outside_await", slow))
+        self.outside_pass = PYFUNCTYPE(None, address, c_uint32)(("outside_pass", quick))
+        self.outside_close = PYFUNCTYPE(None, address, c_char_p)(("outside_close", quick))
         self.equations_restart = CFUNCTYPE(c_int64, address)(("equations_restart", slow))
         self.equations_solve = CFUNCTYPE(c_int64, address, c_double)(("equations_solve", slow))
         by_cvode = CFUNCTYPE(ctypes.c_int, c_double, address, address, address)

@@ -151,6 +151,9 @@ PUBLIC int outside_do_step(OutsideNode *own, double time, double step_size, int 
   return outside_await(own);
 }
 
+/* For Python: as `pass_turn`. */
+PUBLIC void outside_pass(OutsideMemory *memory, uint32_t to) { pass_turn(memory, to); }
+
 /* The run has ended; `text` says why. */
 PUBLIC void outside_close(OutsideMemory *memory, const char *text) {
   snprintf(memory->text, sizeof memory->text, "%s", text);

@@ -1,0 +1,1 @@
+"""Instances whose steps come from programs that we did not start."""
