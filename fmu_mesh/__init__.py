@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         StepFailed,
         UnknownName,
     )
+    from .instances.outside.program import Importer, attach_as
     from .instances.python.component import Component, component
     from .instances.python.declarations import Input, Output, Parameter
     from .pictures.system_graph import SystemGraph
@@ -70,6 +71,7 @@ __all__ = [
     "FmuError",
     "FmuMeshError",
     "FrameGap",
+    "Importer",
     "InitializationFailed",
     "Input",
     "Inspection",
@@ -98,6 +100,7 @@ __all__ = [
     "UnknownName",
     "__version__",
     "attach",
+    "attach_as",
     "component",
     "inspect",
     "inspect_package",
@@ -126,6 +129,7 @@ _NAMES = {
     "api.samples": ("Sample",),
     "api.simulating": ("simulate",),
     "api.system_state": ("BatchState", "SystemState"),
+    "instances.outside.program": ("Importer", "attach_as"),
     "instances.python.component": ("Component", "component"),
     "instances.python.declarations": ("Input", "Output", "Parameter"),
     "pictures.system_graph": ("SystemGraph",),

@@ -270,6 +270,7 @@ class OutsideInstance:
 
     def _listen(self) -> None:
         """Open the socket at which the program attaches."""
+        self._socket_file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._socket_file.unlink(missing_ok=True)
         self._listener = socket.socket(socket.AF_UNIX)
         folder = os.open(self._socket_file.parent, os.O_PATH | os.O_DIRECTORY)
