@@ -361,8 +361,11 @@ class RunReset(Interrupted):
     """A command has reset the mesh: this run ends at `point`, and the same processes begin the next one."""
 
 
-class StepPending(Exception):  # noqa: N818 it is none of our errors, and nobody outside sees it
-    """A step that waits for a program is not done yet: the engine leaves, and takes the same step again."""
+class StepPending(Exception):
+    """A step that waits for a program is not done yet: the engine leaves, and takes the same step again.
+
+    It is none of our errors: nobody beyond the engine sees it.
+    """
 
 
 class TerminationRequested(FmuMeshError):

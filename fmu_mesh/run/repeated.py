@@ -416,7 +416,9 @@ class _Run:
     def _position(self) -> tuple[str, int, str]:
         """See `CallWatch.stepping`; between two steps, the answer changes all the time."""
         runner = self._engine.current if self._engine is not None else None
-        return (runner.name, runner.step, runner.doing) if runner and not runner.awaited else ("", time.monotonic_ns(), "")
+        return (
+            (runner.name, runner.step, runner.doing) if runner and not runner.awaited else ("", time.monotonic_ns(), "")
+        )
 
     def _write_rest(self, engine: Engine) -> None:
         """However the run ends: write the rows that are complete."""

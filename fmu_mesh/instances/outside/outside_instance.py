@@ -1,7 +1,7 @@
 """One instance whose steps come from a program that we did not start; see `fmu_mesh/rings/outside.c` for the memory.
 
-The program gives the first outputs in Initialization Mode, and then each step is one round trip: it gets the inputs, and
-gives the outputs.
+The program gives the first outputs in Initialization Mode, and then each step is one round trip: it gets the inputs,
+and gives the outputs.
 """
 
 from __future__ import annotations
@@ -201,13 +201,13 @@ class OutsideInstance:
             size = _TEXT_BYTES if own.type == "String" else own.size * np.dtype(DTYPES[own.type]).itemsize
             at = (at + 63) // 64 * 64
             is_output = own.causality == "output"
-            head = own.name.encode(), _TYPES.index(own.type), is_output, own.size, at, size
-            heads.append(_VARIABLE.pack(*head))
+            fields = own.name.encode(), _TYPES.index(own.type), is_output, own.size, at, size
+            heads.append(_VARIABLE.pack(*fields))
             self._places[own.name] = at, size
             at += size
-        self._file = os.memfd_create(f"fmu_mesh {self.name}", os.MFD_CLOEXEC)
+        self._file: int = os.memfd_create(f"fmu_mesh {self.name}", os.MFD_CLOEXEC)
         os.ftruncate(self._file, at)
-        self._memory = mmap.mmap(self._file, at)
+        self._memory: mmap.mmap = mmap.mmap(self._file, at)
         self._flat = np.frombuffer(self._memory, np.uint8)
         head = _VERSION, at, len(variables), 1, 0.0, 0.0, b"", _PROGRAM, 0, 0, 0, b"", b""
         self._memory[: _HEAD.size + len(heads) * _VARIABLE.size] = b"".join([_HEAD.pack(*head), *heads])
@@ -218,7 +218,7 @@ class OutsideInstance:
             kind = np.dtype("S4096" if own.type == "String" else DTYPES[own.type])
             self._arrays[own.name] = self._flat[place : place + size].view(kind)
             self._write(own.name, own.start)
-        self._end = _NodeEnd(int(self._flat.ctypes.data), -1, _SLICE_NS, 0)
+        self._end: Any = _NodeEnd(int(self._flat.ctypes.data), -1, _SLICE_NS, 0)
         self._address = ctypes.addressof(self._end)
 
     def _write(self, name: str, value: Any) -> None:  # noqa: ANN401 a value of any type

@@ -63,7 +63,8 @@ class OutsideVariableConfig(Base, frozen=True, kw_only=True):
     unit: Annotated[str | None, Meta(description="Its unit, as in a model description.")] = None
     description: Annotated[str | None, Meta(description="What it is.")] = None
     start: Annotated[
-        PlainValue | None, Meta(description="Its value until somebody sets another one; null: 0, false or an empty text.")
+        PlainValue | None,
+        Meta(description="Its value until somebody sets another one; null: 0, false or an empty text."),
     ] = None
 
 
