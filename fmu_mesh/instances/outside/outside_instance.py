@@ -89,6 +89,7 @@ class OutsideInstance:
         self._has_begun = self._has_rows = False
         self._native: NativeStep | None = None
         self._connection: socket.socket | None = None
+        self._file: int
         self._make_memory(opening.description.variables)
         self._listen()
 
@@ -205,7 +206,7 @@ class OutsideInstance:
             heads.append(_VARIABLE.pack(*fields))
             self._places[own.name] = at, size
             at += size
-        self._file: int = os.memfd_create(f"fmu_mesh {self.name}", os.MFD_CLOEXEC)
+        self._file = os.memfd_create(f"fmu_mesh {self.name}", os.MFD_CLOEXEC)
         os.ftruncate(self._file, at)
         self._memory: mmap.mmap = mmap.mmap(self._file, at)
         self._flat = np.frombuffer(self._memory, np.uint8)
