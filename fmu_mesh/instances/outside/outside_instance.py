@@ -30,7 +30,7 @@ from ...variables.model_description import Variable
 from ...variables.value_conversion import to_value
 from ...variables.value_types import DTYPES, Value, flattened, nested
 from ..contract import Opening
-from .outside_kind import OutsideConfig
+from .outside_section import OutsideConfig
 
 __all__ = ["OutsideInstance"]
 
