@@ -161,6 +161,7 @@ _ZENOH = "zenoh lockstep by hand"
 _MEMORY = "shared memory, C"
 _STREAMS = "fmu_mesh, row streams"
 _BY_ZENOH = "fmu_mesh, Zenoh"
+_NATIVE, _WINE = "fmu_mesh, native", "fmu_mesh, under Wine"
 _APART = "without shared memory, as between two hosts"
 
 
@@ -318,6 +319,24 @@ JOBS = (
             Entry("fmu_mesh, jacobi", OURS, 10_000, options={"window": "1"}, coupling="jacobi"),
             Entry(f"{_ZENOH}, gauss_seidel", "zenoh_lockstep", 5_000, 3_000),
             Entry(f"{_ZENOH}, jacobi", "zenoh_lockstep", 5_000, 3_000, coupling="jacobi"),
+            _limit(f"{_MEMORY}: one round trip", "memory", "c", points=200_000),
+        ),
+    ),
+    Job(
+        "windows",
+        "two trivial FMUs in a chain: with a library for Windows, under Wine, and their native twins",
+        _CHAIN2,
+        (
+            Entry(_NATIVE, OURS, 100_000),
+            Entry(_WINE, OURS, 100_000, options={"windows": "yes"}),
+            Entry(f"{_NATIVE}, window 1", OURS, 10_000, options={"window": "1"}),
+            Entry(
+                f"{_WINE}, window 1",
+                OURS,
+                10_000,
+                options={"window": "1", "windows": "yes"},
+                beside=f"{_NATIVE}, window 1",
+            ),
             _limit(f"{_MEMORY}: one round trip", "memory", "c", points=200_000),
         ),
     ),

@@ -20,6 +20,7 @@ from benchmarks.environment import ROOT, Peers
 from benchmarks.first_step import FirstStep, Started
 from benchmarks.jobs import Entry, Job
 from benchmarks.task import Outcome, System, Task
+from benchmarks.windows import why_no_windows
 
 __all__ = ["Bench", "Measured"]
 
@@ -146,6 +147,8 @@ class Bench:
         system = entry.system or job.system
         points = (entry.quick or entry.points) if self._quick else entry.points
         missing = "not in a quick run" if self._quick and entry.rounds == 1 else self._peers.missing(entry.packages)
+        if entry.options.get("windows") == "yes":
+            missing = missing or why_no_windows()
         return Measured(max(len(system.members), 1), points, failure=missing)
 
     def _measure(self, job: Job, entry: Entry, about: str, timeout_s: float) -> None:

@@ -58,6 +58,7 @@ _BATCH, _C_LOOP = "fmu_mesh, batch()", "C, a loop over copies"
 _BATCH_TO_STATE, _C_STATE = "reset() of a batch to states", "C: fmi2SetFMUstate"
 _DOPRI5, _C_SOLVER = "fmu_mesh, dopri5", "C, the solver of dopri5"
 _SWEEP, _C_SWEEP = "fmu_mesh, from the call to the table", "C, two processes, new instances"
+_WINE, _WINE_1 = "fmu_mesh, under Wine", "fmu_mesh, under Wine, window 1"
 _WINDOW1 = "fmu_mesh, gauss_seidel"
 _OPEN, _TO_STATE, _VALUES = "fmu_mesh, open()", "reset() to a state", "reset() with start values"
 
@@ -67,6 +68,8 @@ TARGETS = (
     Target("cycle in own processes, against the FMPy loop", "cycle2", "fmu_mesh", "times as fast", 8, 30, _FMPY),
     Target("cycle in one group, against the FMPy loop", "group", "fmu_mesh", "times as fast", 40, 80, _FMPY),
     Target("window 1: a point, against a round trip", "window1", _WINDOW1, "times as long", 25, 8, _ROUND_TRIP),
+    Target("FMUs under Wine, against native ones", "windows", _WINE, "times as long", 3, 2, "fmu_mesh, native"),
+    Target("window 1 under Wine, against a round trip", "windows", _WINE_1, "times as long", 15, 8, _ROUND_TRIP),
     Target("chain of 8 against chain of 2", "chain8", _EIGHT, "times as long, each", 1.0, 0.7, _TWO),
     Target(
         "cycle by streams, a point, against a TCP round trip", "apart_cycle", _STREAMS, "times as long", 3, 1.5, _TCP

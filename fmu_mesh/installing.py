@@ -51,13 +51,13 @@ PROGRAMS: Final[Mapping[str, tuple[str, str]]] = {
         "Install the programs of Slurm (Debian, Ubuntu: apt install slurm-client), or run this on a login host.",
     ),
     "ssh": ("nodes on other hosts", "Install it, on Debian with `apt install openssh-client`."),
-    "wine": ("FMUs that have only Windows binaries", "Install it, on Debian with `apt install wine64`."),
+    "wine": ("FMUs that have only Windows binaries", "Install it, on Debian with `apt install wine`."),
     "zenoh-bridge-ros2dds": ("meshes beside ROS on DDS", "Start it where ROS is; `ros.connect` says where that is."),
 }
 """Programs of the system: what needs each, a plural, and what to do without it."""
 
 _OURS = "fmu-mesh"
-_BOUND = re.compile(r"(>=|<)\s*([\d.]+)")
+_BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
 @contextmanager
@@ -101,7 +101,8 @@ def version_of_library(library: str) -> str:
         raise _missing(library) from error
     requirement = _requirement(library)
     for sign, bound in _BOUND.findall(requirement):
-        if (_numbers(version) >= _numbers(bound)) != (sign == ">="):
+        own, wanted = _numbers(version), _numbers(bound)
+        if not {">=": own >= wanted, "<": own < wanted, "==": own == wanted}[sign]:
             raise _missing(library, but=f": {requirement}, and {version} is installed")
     return version
 

@@ -2,6 +2,7 @@
 
 Options: `window`; `group` = `one` puts all instances into one node; `local` = `yes` is `launch --local`; `record` =
 `outputs` (the outputs that the system reads), `all` or `none`; `apart` = `streams` or `zenoh` is without shared memory;
+`windows` = `yes` takes the FMUs with a library for Windows, which run under Wine;
 `result` is the CSV file; `checkout` is the folder of another checkout with its `.venv`, whose fmu_mesh runs instead.
 """
 
@@ -17,6 +18,7 @@ from typing import Any
 
 from benchmarks.contestants.entry import FMUS, main, versions
 from benchmarks.task import Outcome, Task
+from benchmarks.windows import windows_fmu
 
 __all__ = ["configuration", "launch_command", "launched"]
 
@@ -67,7 +69,8 @@ def configuration(task: Task) -> dict[str, Any]:
     instances: dict[str, dict[str, Any]] = {}
     connections = []
     for index, member in enumerate(system.members):
-        instances[member.name] = {"fmu": str(FMUS / f"{member.fmu}.fmu"), "start_values": member.start_values}
+        fmu = windows_fmu(member.fmu) if options.get("windows") == "yes" else FMUS / f"{member.fmu}.fmu"
+        instances[member.name] = {"fmu": str(fmu), "start_values": member.start_values}
         if options.get("group") == "one":
             instances[member.name]["group"] = "together"
         source = system.source_of(index)

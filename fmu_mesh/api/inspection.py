@@ -243,7 +243,7 @@ def _facts(inspection: Inspection, width: int) -> list[str]:
         ("GUID", description.guid),
         ("Made by", description.generation_tool or ""),
         ("Platforms", platforms or ("none" if description.kinds else "")),
-        ("Runs here", _RUNS_WORDS[description.runs] if inspection.runs_here else "no, see Problems"),
+        ("Runs here", _runs(description) if inspection.runs_here else "no, see Problems"),
         ("Can", ", ".join(can)),
         ("Needs", ", ".join(needs)),
         ("Experiment", ", ".join(times)),
@@ -261,8 +261,14 @@ def _kind(description: ModelDescription) -> str:
     return f"FMI {description.fmi_version} {kinds}" if kinds else description.kind.replace("_", " ")
 
 
+def _runs(description: ModelDescription) -> str:
+    from ..instances.fmi.wine import wine_version  # noqa: PLC0415  what starts programs is slow to import
+
+    return f"under {wine_version()}" if description.runs == "wine" else _RUNS_WORDS[description.runs]
+
+
 _KIND_WORDS: Final[dict[Kind, str]] = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
-_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "yes", "wine": "under Wine"}
+_RUNS_WORDS: Final[dict[Runs, str]] = {"native": "yes", "wasm": "in WebAssembly"}
 _PLATFORM_WORDS: Final = {"c-code": "C sources"}
 
 

@@ -153,7 +153,22 @@ def planned_rerun(result: str | Path, options: RerunOptions) -> PlannedRerun:
         on_notice(f"'{path}' was made by fmu_mesh {version}, and this is {__version__}")
     if differs := machine_difference(metadata.versions, machine()):
         on_notice(f"'{path}' was made on another machine than this, so last digits may differ: {differs}")
+    if differs := _computed_otherwise(metadata, plan):
+        on_notice(f"'{path}' was computed otherwise than on this host, so values may differ: {differs}")
     return PlannedRerun(plan, values, last_point, first)
+
+
+def _computed_otherwise(metadata: RunMetadata, plan: RunPlan) -> str:
+    """In words what computes models here with another solver or another version of Wine; empty if nothing does.
+
+    Files and configuration are those of the first run, so only the host can make a difference.
+    """
+    differs = []
+    for name, own in metadata.models.items():
+        now = plan.loaded.config.instances[name].summary(plan.plan.system.instances[name].description)
+        if own.computed_by not in {"", now}:
+            differs.append(f"'{name}' by '{own.computed_by}', and here by '{now}'")
+    return ", ".join(differs)
 
 
 def _metadata_of(path: Path, result: Result) -> tuple[RunMetadata, list[SetValue]]:

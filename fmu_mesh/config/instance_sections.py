@@ -153,8 +153,8 @@ class ProcessConfig(Base, frozen=True, kw_only=True):
         Literal["none", "bubblewrap", "wasm"] | None,
         Meta(
             description="bubblewrap: without the network, other processes, and all files but the model and those of "
-            "the system, which it can only read; wasm: sources of an FMU are compiled for WebAssembly and run in "
-            "wasmtime, without files and network, and with `memory`, or 1 GiB, of its own."
+            "the system, which it can only read; wasm: sources of an FMU, compiled for WebAssembly, or its "
+            "component run in wasmtime, without files and network, and with `memory`, or 1 GiB, of its own."
         ),
     ] = None
 

@@ -52,6 +52,7 @@ typedef struct { /* the host of one FMU, for the node */
   char *mailbox;
   int64_t size;     /* of the memory that begins with it */
   int64_t to, from; /* the ends of the pipes */
+  int64_t process;  /* its number */
   char *shared, *shared_there; /* the memory of the run, if the host has it, too */
   int64_t shared_size;
   Twin *functions;

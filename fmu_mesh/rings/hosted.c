@@ -18,11 +18,12 @@
 #define _GNU_SOURCE
 #include <poll.h>
 #include <string.h>
+#include <sys/wait.h>
 
 #include "counters.h"
 #include "windows_host.h"
 
-enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 10000, LOOK_MS = 100, LONG_STEPS = 16 };
+enum { FATAL = 4, STAGE_BITS = 24, LOOK_NS = 10000, LOOK_MS = 100, END_MS = 1000, LONG_STEPS = 16 };
 
 /* See messages.c. */
 void log_of_host(const void *address, const char *name, int status, const char *category, const char *text);
@@ -70,6 +71,24 @@ static void show(const Packed *packed) {
   member->said->step = ((const Said *)back(packed->host, packed->copy->said))->step;
 }
 
+/* How a host has ended that has closed its pipe, as the end of a sentence. */
+static void note_end(const Host *host, char *text, size_t size) {
+  const int process = (int)syscall(SYS_pidfd_open, (pid_t)host->process, 0);
+  struct pollfd end = {.fd = process, .events = POLLIN};
+  siginfo_t how = {0};
+  if (process >= 0) {
+    poll(&end, 1, END_MS);
+    waitid(P_PID, (id_t)host->process, &how, WEXITED | WNOHANG | WNOWAIT);
+    close(process);
+  }
+  if (how.si_pid != 0 && how.si_code == CLD_EXITED)
+    snprintf(text, size, "has ended with exit code %d", how.si_status);
+  else if (how.si_pid != 0)
+    snprintf(text, size, "was ended by signal %d", how.si_status);
+  else
+    snprintf(text, size, "has ended");
+}
+
 static void end_host(Host *host) {
   Mailbox *box = mailbox_of(host);
   char text[700];
@@ -80,7 +99,7 @@ static void end_host(Host *host) {
              (unsigned long long)box->crash, box->crash == 0xC0000005 ? " (access violation)" : "",
              (unsigned long long)box->crash_address, box->text[0] ? " of " : "", box->text);
   else
-    snprintf(text, sizeof text, "the process of the FMU under Wine has ended");
+    note_end(host, text + snprintf(text, sizeof text, "the process of the FMU under Wine "), 100);
   log_of_host(NULL, host->name, FATAL, "wine", text);
 }
 

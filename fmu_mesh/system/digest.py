@@ -26,11 +26,12 @@ def digest_of(configuration: object, system: ResolvedSystem, contents: Mapping[s
 
     A model is the GUID and the SHA-256 of its content; the configuration is what must be equal, as JSON can hold it.
     What the solver `auto` is depends on the host: without the library of C, the same configuration gives other floats.
+    Which Wine runs an FMU for Windows is in its metadata only: a version for each host is no other configuration.
     """
     models = [(name, own.description) for name, own in sorted(system.instances.items())]
     hashes = [_hash((model.guid, contents.get(name, "")))[:_MODEL_DIGITS] for name, model in models]
     solved = [(name, model) for name, model in models if model.kind == "model_exchange"]
-    solvers = [system.config.instances[name].summary(model) for name, model in solved]
+    solvers = [system.config.instances[name].summary(model).partition(", under ")[0] for name, model in solved]
     return " ".join([__version__, _hash((configuration, solvers))[:_CONFIGURATION_DIGITS], *hashes])
 
 

@@ -31,6 +31,7 @@ __all__ = [
     "Variability",
     "Variable",
     "VariableType",
+    "runs_of",
 ]
 
 Causality = Literal[
@@ -39,8 +40,14 @@ Causality = Literal[
 Variability = Literal["constant", "fixed", "tunable", "discrete", "continuous"]
 Initial = Literal["exact", "approx", "calculated"]
 Kind = Literal["co_simulation", "model_exchange"]
-Runs = Literal["native", "wine"]
-"""What runs the library of an FMU: the process itself, or Wine."""
+Runs = Literal["native", "wine", "wasm"]
+"""What runs the library of an FMU: the process itself, Wine, or wasmtime, whose library is a component."""
+
+
+def runs_of(library: str | None) -> Runs:
+    """What runs a library of an FMU, by its name."""
+    suffix = library.rpartition(".")[2] if library is not None else ""
+    return "wine" if suffix == "dll" else "wasm" if suffix == "wasm" else "native"
 
 
 class Variable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -219,8 +226,8 @@ class ModelDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
 
     @property
     def runs(self) -> Runs:
-        """What runs it on this system; `wine` if it only has a library for Windows."""
-        return "wine" if self.library is not None and self.library.endswith(".dll") else "native"
+        """What runs it on this system: its library says it, such as `wine` for one that is only for Windows."""
+        return runs_of(self.library)
 
     @property
     def step_size(self) -> float | None:

@@ -67,7 +67,7 @@ def doctor(*prefix: str) -> tuple[int, dict[str, HostCheck]]:
             "Install one, name it in $CC, or export the",
         ),
         ("C++ compiler", "there is no compiler (looked for c++, g++, clang++)", "Install one, name it in $CXX, or"),
-        ("wine", "FMUs that have only Windows binaries need the program wine", "on Debian with `apt install wine64`."),
+        ("wine", "FMUs that have only Windows binaries need the program wine", "on Debian with `apt install wine`."),
         ("Gazebo classic", "does not run on this host: there is no 'gazebo_lockstep'", "Build bridges/gazebo_classic"),
         ("Sandbox", "bubblewrap, which is not installed", "Use `apt-get install bubblewrap`, or `sandbox: none`."),
         ("ssh", "nodes on other hosts need the program ssh", "on Debian with `apt install openssh-client`."),

@@ -138,7 +138,7 @@ def test_an_fmu_that_cannot_run_here_is_shown_with_the_reason(
     assert "Runs here    no, see Problems" in page
     assert "Problems (2)" in page
     assert "has no binary for this platform (linux64); it has: win64." in " ".join(page.split())
-    assert "or with its sources; `apt install wine64` lets it run under Wine." in " ".join(page.split())
+    assert "or with its sources; `apt install wine` lets it run under Wine." in " ".join(page.split())
     assert "attribute 'colour'" in " ".join(page.split())
 
 

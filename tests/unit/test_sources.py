@@ -396,7 +396,7 @@ def test_two_processes_at_once_compile_without_harm(tmp_path: Path, cache: Path)
 @pytest.mark.parametrize(
     ("others", "ways_out"),
     [
-        (["win64", "aarch64-darwin"], "; `apt install wine64` lets it run under Wine."),
+        (["win64", "aarch64-darwin"], "; `apt install wine` lets it run under Wine."),
         (["win32"], ", or for 64-bit Windows, to run under Wine: libraries for 32-bit Windows are not supported yet."),
         (["aarch64-darwin"], "."),
     ],

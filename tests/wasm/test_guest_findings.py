@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 import fmu_mesh
-from fmu_mesh.instances.fmi.webassembly import compiling
 from tests.fmus.event_fmus import event_source_fmu
 from tests.fmus.packing import repacked
 from tests.wasm.guests import SANDBOX, meshed, rogue
@@ -28,21 +28,18 @@ def test_an_fmu_of_fmi_1_is_refused(tmp_path: Path) -> None:
 def test_an_fmu_without_sources_is_refused(tmp_path: Path) -> None:
     fmu = repacked(tmp_path / "binary.fmu", keep=lambda name: not name.startswith("sources/"))
 
-    assert "has no sources, which `sandbox: wasm` needs" in refusal(meshed(fmu))
+    assert "has neither sources nor a component, and `sandbox: wasm` needs one of them" in refusal(meshed(fmu))
 
 
-@pytest.mark.parametrize("process", [None, SANDBOX])
-def test_a_component_of_the_draft_is_refused(tmp_path: Path, process: dict[str, str] | None) -> None:
+def test_a_component_for_another_version_of_fmi_is_refused(tmp_path: Path) -> None:
     fmu = repacked(
         tmp_path / "component.fmu",
         keep=lambda name: name == "modelDescription.xml",
         add={"binaries/wasm32-wasip2/Gain.wasm": b"\0asm\x0d\0\1\0"},
     )
 
-    text = refusal(meshed(fmu, process))
-
-    assert "has no binary for this platform (linux64); it has: wasm32-wasip2" in text
-    assert "is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with its sources" in text
+    assert "has no binary for this platform (linux64); it has: wasm32-wasip2" in refusal(meshed(fmu, None))
+    assert "has neither sources nor a component, and `sandbox: wasm` needs one" in refusal(meshed(fmu))
 
 
 def test_a_component_in_python_is_refused(tmp_path: Path) -> None:
@@ -58,11 +55,12 @@ def test_a_component_in_python_is_refused(tmp_path: Path) -> None:
 
 
 def test_another_wasmtime_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "WASMTIME", "49.")
+    monkeypatch.setattr(metadata, "version", lambda _library: "49.0")
 
     text = refusal(meshed(rogue(tmp_path)))
 
-    assert "is installed, and the sandbox is written for 49.x (`pip install 'wasmtime==49.*'`)" in text
+    assert "FMUs in WebAssembly need the library" in text
+    assert "and 49.0 is installed" in text
 
 
 def test_sources_that_need_another_system_say_what(tmp_path: Path) -> None:

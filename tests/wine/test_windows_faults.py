@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import zipfile
 from collections.abc import Mapping
@@ -10,7 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.fmus.helpers import FMUS
+from fmus.build import WINDOWS_FROM_LINUX, build
+from tests.fmus.helpers import FMUS, SOURCES
 from tests.helpers import Place, row_count, rows_of, wait_until, write_config
 from tests.wine.windows import NEEDS_WINE, windows_fmu
 
@@ -22,14 +24,18 @@ LEFT_S = 15.0
 
 
 def with_faulty(
-    place: Place, start_values: Mapping[str, float | bool], stop_time: float = 2.0, step_s: float = 60.0
+    place: Place,
+    start_values: Mapping[str, float | bool],
+    stop_time: float = 2.0,
+    step_s: float = 60.0,
+    fmu: Path | None = None,
 ) -> Path:
     """A native pendulum that feeds the Windows FMU with faults, in steps of 1 ms."""
     return write_config(
         place.folder,
         instances={
             "pendulum": {"fmu": str(FMUS / "DampedPendulum.fmu")},
-            "faulty": {"fmu": str(windows_fmu("Faulty")), "start_values": dict(start_values)},
+            "faulty": {"fmu": str(fmu or windows_fmu("Faulty")), "start_values": dict(start_values)},
         },
         connections=["pendulum.a -> faulty.u"],
         stop_time=stop_time,
@@ -75,8 +81,28 @@ def test_a_crash_in_a_step_names_instance_and_point(place: Place, options: tuple
     launched = place.run("launch", config, *options)
 
     assert launched.wait() == 3
-    assert "instance faulty, point 1000, t = 1 s: " in launched.message
+    said = (
+        "point 1000, t = 1 s: fmi2DoStep returned fatal; the FMU says: the process of the FMU under Wine has ended with"
+    )
+    assert f"instance faulty, {said} exit code 3" in launched.message  # of `abort`
     assert [row[0] for row in rows_of(config.with_suffix(".csv"))] == [point * 0.001 for point in range(1001)]
+    place.assert_nothing_left(LEFT_S)
+
+
+def test_an_access_violation_names_its_place_in_the_dll(place: Place) -> None:
+    sources = shutil.copytree(SOURCES / "Faulty", place.folder / "Faulty")
+    code = (sources / "Faulty.c").read_text(encoding="utf-8")
+    assert "abort();" in code
+    (sources / "Faulty.c").write_text(code.replace("abort();", "*(volatile int *)16 = 1;"), encoding="utf-8")
+    fmu = build(sources, place.folder, WINDOWS_FROM_LINUX)
+    config = with_faulty(place, {"crash_at": 1.0}, fmu=fmu)
+
+    launched = place.run("launch", config)
+
+    assert launched.wait() == 3
+    assert "instance faulty, point 1000, t = 1 s: fmi2DoStep returned fatal; the FMU says: " in launched.message
+    assert "crashed under Wine: exception 0xC0000005 (access violation) at 0x" in launched.message
+    assert " of Faulty.dll" in launched.message
     place.assert_nothing_left(LEFT_S)
 
 
@@ -109,8 +135,9 @@ def test_a_windows_program_that_is_killed_ends_the_run_with_names(place: Place) 
 
     host_in(place).kill()
 
-    assert launched.wait() in (3, 4)
+    assert launched.wait() == 3
     assert "instance faulty, point " in launched.message
+    assert "the FMU says: the process of the FMU under Wine was ended by signal 9" in launched.message
     place.assert_nothing_left(LEFT_S)
 
 

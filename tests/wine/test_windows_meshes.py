@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,9 +11,11 @@ from typing import Any
 import pytest
 import yaml
 
+import fmu_mesh
+from fmu_mesh.instances.fmi.wine import wine_version
 from tests.equivalence.reference import Pipe, Reference, Table, Unit
 from tests.fmus.event_fmus import Version, build_event_fmu
-from tests.fmus.helpers import FMUS, session_folder
+from tests.fmus.helpers import FMUS, build_test_fmu, session_folder
 from tests.helpers import BY_STREAMS, Place, rows_of, write_config
 from tests.wine.windows import NEEDS_WINE, run_dlls, windows_event_fmu, windows_fmu
 
@@ -154,9 +158,73 @@ def test_all_versions_and_kinds_give_the_floats_of_their_native_twins(
     place.assert_nothing_left(within_s=5.0)
 
 
+@pytest.mark.parametrize("arguments", [(), ("--local",)], ids=["distributed", "local"])
+def test_bytes_texts_and_arrays_of_both_go_through(place: Place, arguments: tuple[str, ...]) -> None:
+    """Binary values have zeros in them, are empty, and change their sizes from point to point."""
+    data = [base64.b64encode(value).decode() for value in (b"", b"\0", b"a\0\0b", bytes(range(256)), b"\xff" * 99_999)]
+    texts = ["", "a", "ü b", "c" * 70_000]
+    times = {"times": [0.01 * point for point in range(1, 6)]}
+    values = {
+        "a.binary_in": times | {"values": data},
+        "a.binary_array_in": times | {"values": [[data[n : n + 2], data[3 - n : 5 - n]] for n in (0, 1, 2, 3, 0)]},
+        "a.string_in": times | {"values": [*texts, texts[1]]},
+        "a.string_array_in": times | {"values": [[texts[n : n + 2], texts[1 - n : 3 - n]] for n in (0, 1, 0, 1, 0)]},
+    }
+    outputs = [name.removeprefix("a.").replace("_in", "_out") for name in values]
+
+    def run(name: str, fmu: Path) -> bytes:
+        config = write_config(
+            place.folder,
+            instances={
+                one: {"fmu": str(fmu), "start_values": {"columns": 2, "binary_parameter": data[3]}} for one in "ab"
+            },
+            connections=[f"a.{output} -> b.{output.replace('_out', '_in')}" for output in outputs],
+            name=name,
+            stop_time=0.08,
+            simulation={"step_size": 0.01},
+            scenario={"values": values},
+            record={"file": f"{name}.csv", "variables": [f"{one}.{output}" for one in "ab" for output in outputs]},
+        )
+        launched = place.run("launch", config, *arguments)
+        assert launched.wait() == 0, launched.errors
+        return config.with_suffix(".csv").read_bytes()
+
+    windows = run("windows", windows_fmu("AllTypes3"))
+
+    assert windows == run("native", build_test_fmu("AllTypes3", place.folder))
+    assert base64.b64encode(b"\xff" * 99_999) in windows
+    place.assert_nothing_left(within_s=5.0)
+
+
+@pytest.mark.parametrize("name", ["AllTypes1", "Steps1"])
+def test_co_simulation_of_fmi1_gives_the_values_of_its_twin(tmp_path: Path, name: str) -> None:
+    windows = fmu_mesh.simulate(windows_fmu(name), stop_time=1.0, step_size=0.1)
+    native = fmu_mesh.simulate(build_test_fmu(name, tmp_path), stop_time=1.0, step_size=0.1)
+
+    assert {name: windows[name].tolist() for name in windows} == {name: native[name].tolist() for name in native}
+    assert len(native.times) == 11
+
+
 def test_inspect_and_check_say_that_it_runs_under_wine(place: Place) -> None:
     inspected = place.run("inspect", windows_fmu("Gain"))
     checked = place.run("check", mesh_of(place, ["gain"]))
 
-    assert "Runs here    under Wine" in inspected.output
-    assert "gain      Gain.fmu (FMI 2.0, under Wine)" in checked.output
+    assert f"Runs here    under {wine_version()}" in inspected.output
+    assert f"gain      Gain.fmu (FMI 2.0, under {wine_version()})" in checked.output
+
+
+def test_a_rerun_under_another_wine_says_so(place: Place) -> None:
+    config = mesh_of(place, ["gain"])
+    assert place.run("launch", config, "--local", "--stop-time", "0.1").wait() == 0
+    beside = place.folder / "result.csv.json"
+    made = json.loads(beside.read_text(encoding="utf-8"))
+    assert made["models"]["gain"]["computed_by"] == f"FMI 2.0, under {wine_version()}"
+    made["models"]["gain"]["computed_by"] = "FMI 2.0, under Wine 1.0"
+    beside.write_text(json.dumps(made), encoding="utf-8")
+    notices: list[str] = []
+
+    again = fmu_mesh.rerun(place.folder / "result.csv", on_notice=notices.append)
+
+    (notice,) = notices
+    assert f"'gain' by 'FMI 2.0, under Wine 1.0', and here by 'FMI 2.0, under {wine_version()}'" in notice
+    assert fmu_mesh.Result.read(place.folder / "result.csv").compare(again).equal

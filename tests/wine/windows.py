@@ -23,7 +23,7 @@ from tests.fmus.helpers import FMUS, SOURCES, session_folder
 __all__ = ["NEEDS_WINE", "run_dlls", "windows_event_fmu", "windows_fmu", "windows_program"]
 
 _MISSING = [
-    *(["`apt install wine64`"] if wine_program() is None else []),
+    *(["`apt install wine`"] if wine_program() is None else []),
     *(["`make library` for its compiler"] if find_spec("ziglang") is None else []),
 ]
 NEEDS_WINE = pytest.mark.skipif(bool(_MISSING), reason=f"needs {' and '.join(_MISSING)}")

@@ -172,14 +172,14 @@ class FmuConfig(Base, InstanceSection, frozen=True, kw_only=True, tag_field=KIND
             findings.add(f"{place}.retry_discarded_steps", f"true, but {reason}", "false")
 
     def summary(self, description: ModelDescription) -> str:
-        """The version of FMI; the solver, or for co-simulation a tolerance that is set; whether it runs under Wine."""
+        """The version of FMI; the solver, or for co-simulation a tolerance that is set; what it runs in."""
         if description.kind == "co_simulation":
             solver = f", tolerance {self.tolerance:g}" if self.tolerance is not None else ""
         else:
             settings = self.solver_settings(description)
             tolerance = f" {settings.relative_tolerance:g}" if settings.name != "euler" else ""
             solver = f" model exchange, {settings.name}{tolerance}"
-        return f"FMI {description.fmi_version}{solver}{', under Wine' if description.runs == 'wine' else ''}"
+        return f"FMI {description.fmi_version}{solver}{_runs(description)}"
 
     def other_kind(self, description: ModelDescription) -> str | None:
         """See `InstanceSection`: `auto` uses the co-simulation of an FMU that has both."""
@@ -259,11 +259,11 @@ class FmuKind(Kind[FmuConfig]):
         return content_of(path)
 
     def claims(self, path: Path, section: FmuConfig, description: ModelDescription, limits: LimitsConfig) -> Claims:
-        """What its libraries have that a process has only once; nothing of what is compiled or runs under Wine."""
+        """What its libraries have that a process has only once; nothing of what is compiled or another program runs."""
         from .archive.archive import opened  # noqa: PLC0415  as above
         from .archive.library_names import claims_of  # noqa: PLC0415  as above
 
-        if description.library is None or description.runs == "wine":
+        if description.library is None or description.runs != "native":
             return {}
         with opened(path, Terms(limits, section.sha256)) as fmu:
             return claims_of(fmu, description.library)
@@ -325,3 +325,11 @@ def _cannot_retry(description: ModelDescription) -> str | None:
     if description.fmi_version.startswith("2.") and not description.can_get_and_set_state:
         return "the FMU cannot get and set its state, so it cannot go back to where the step began"
     return None
+
+
+def _runs(description: ModelDescription) -> str:
+    if description.runs == "wine":
+        from .wine import wine_version  # noqa: PLC0415  what starts programs is slow to import
+
+        return f", under {wine_version()}"
+    return ", in WebAssembly" if description.runs == "wasm" else ""

@@ -10,19 +10,20 @@ import ctypes
 import inspect
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from copy import copy
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, Final, Self
+from types import UnionType
+from typing import Any, Final, NamedTuple, Self, get_args
 
 import numpy as np
 from fmpy import freeLibrary
 
 from .archive.shared_library import SYMBOL, SharedLibrary, read_shared_library
 
-__all__ = ["MISSING", "FmuLibrary", "absent", "calling"]
+__all__ = ["MISSING", "Argument", "FmuLibrary", "absent", "arguments_of", "calling", "count_of"]
 
 MISSING: Final = 999
 """Our own status of a function that the library of an FMU does not have."""
@@ -30,6 +31,8 @@ MISSING: Final = 999
 _NOT_MADE: Final = "Failed to instantiate model"  # in the words of FMPy
 _ABSENT: Final = ctypes.CFUNCTYPE(ctypes.c_int)
 _DEEP_BINDING: Final = getattr(os, "RTLD_DEEPBIND", 0)
+_POINTER: Final[Any] = ctypes.POINTER(ctypes.c_int).__base__
+_FUNCTION: Final[Any] = ctypes.CFUNCTYPE(None).__base__
 _RTLD_DI_LINKMAP: Final = 2
 _DT_NEEDED: Final = 1
 _DT_STRTAB: Final = 5
@@ -134,6 +137,45 @@ class FmuLibrary(_Library):
 def absent() -> Any:  # noqa: ANN401 as in ctypes
     """A function in the place of one that a library does not have."""
     return _ABSENT(lambda: MISSING)
+
+
+class Argument(NamedTuple):
+    """One argument of a function of FMI."""
+
+    name: str
+    type: Any  # of ctypes
+    items: Any  # the type of what it points to; None if it is no pointer
+
+    @classmethod
+    def of(cls, known: inspect.Parameter) -> Argument:
+        """As FMPy has it."""
+        own = known.annotation
+        type_ = get_args(own)[0] if isinstance(own, UnionType) else own
+        is_pointer = issubclass(type_, _POINTER)
+        return cls(known.name, type_, type_._type_ if is_pointer else None)
+
+    @property
+    def passed(self) -> Any:  # noqa: ANN401 as above
+        """The type of ctypes that our functions get it in."""
+        is_address = self.items is not None or issubclass(self.type, _FUNCTION)
+        return ctypes.c_void_p if is_address else self.type
+
+
+def arguments_of(fmpy_class: type[Any], name: str) -> tuple[list[Argument], Any]:
+    """Those of the function that FMPy's class calls by this name, and the type of its result as FMPy has it."""
+    known = inspect.signature(getattr(fmpy_class, name))
+    return [Argument.of(one) for one in list(known.parameters.values())[1:]], known.return_annotation
+
+
+def count_of(arguments: Sequence[Argument], values: Sequence[Any], index: int) -> int:
+    """How many items an argument points to: the next number of that type says it, or else the one before (FMI)."""
+    own = arguments[index]
+    if own.items is ctypes.c_void_p:  # a state
+        return 1
+    sizes = [place for place, one in enumerate(arguments) if one.type is ctypes.c_size_t]
+    if own.name == "dvUnknown":  # of FMI 2.0, after the known ones
+        return int(values[sizes[0]])
+    return next((int(values[place]) for place in (*(s for s in sizes if s > index), *sizes[::-1])), 1)
 
 
 class _LoadedBefore:

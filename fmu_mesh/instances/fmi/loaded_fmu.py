@@ -23,6 +23,7 @@ from ..process_state import FOLDER
 from .archive.examining import library_name
 from .archive.sources import extract
 from .calls import FmpyCalls, cffi_function, pointer
+from .component_library import ComponentLibrary
 from .fmu_library import FmuLibrary, calling
 from .fmu_values import FATAL, ValueFunctions
 from .step_options import Terms
@@ -157,12 +158,14 @@ class LoadedFmu:
             description.model_identifier, description.fmi_version, names, description.runs
         )
         with FOLDER, chdir(path.parent):  # libraries may name others relative to it
-            library: FmuLibrary | WineLibrary
+            library: FmuLibrary | WineLibrary | ComponentLibrary
             if description.runs == "wine":
                 library = WineLibrary(path, functions.library, self._fmu.name)
+            elif description.runs == "wasm":
+                library = ComponentLibrary(path, functions.library, description.kind, description.guest_memory)
             else:
                 library = FmuLibrary(path, deep_binding=self._fmu.deep_binding)
-            if description.guest_memory is not None:
+            if description.guest_memory is not None and description.runs == "native":
                 memory, limits = ctypes.c_int64(description.guest_memory), self._fmu.timeouts
                 library.fmu_mesh_guest_limits(memory, ctypes.c_double(limits.call), ctypes.c_double(limits.step))
             return calling(functions.library)(

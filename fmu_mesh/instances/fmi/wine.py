@@ -6,8 +6,9 @@ share it, and it ends by itself when the last of them has ended (at once in Debi
 """
 
 # Who meets here (ADR 99): any number of processes may ask for the prefix at once, also those of several runs. One makes
-# it, under a lock and with another name, and renames it when it is complete; so nobody ever uses one that is half made,
-# and a maker that was killed leaves a draft that the next one removes. `flock` has no deadline: a thread waits for it.
+# it, under a lock and with another name, and renames it when it is complete; so nobody ever uses one that is half made.
+# The Wine of a maker that was killed goes on: the next maker ends it, and then removes its draft (a server whose folder
+# is gone never ends). `flock` has no deadline: a thread waits for it.
 # Given up: a prefix for each run. It takes ten seconds.
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from typing import Final
 from ... import files
 from ...errors import LoadFailed
 
-__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program"]
+__all__ = ["INSTALL_WINE", "windows_path", "windows_uri", "wine_environment", "wine_program", "wine_version"]
 
 log = logging.getLogger(__name__)
 
-INSTALL_WINE: Final = "`apt install wine64` lets it run under Wine"
+INSTALL_WINE: Final = "`apt install wine` lets it run under Wine"
 """What to do about an FMU that has only binaries for Windows."""
 
 _PREPARE_S: Final = 300.0
@@ -62,7 +63,7 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
     """
     if (program := wine_program()) is None:
         raise LoadFailed("Wine, which runs Windows FMUs, is not installed.", hint=f"{INSTALL_WINE}.")
-    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", _version(program)).strip("-")
+    prefix = files.cache_folder() / "wine" / re.sub(r"[^\w.]+", "-", _version()).strip("-")
     if not prefix.is_dir():
         try:
             prefix.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -80,6 +81,15 @@ def wine_environment(tell: Callable[[str], None] = log.info) -> dict[str, str]:
     return _environment(prefix, _OVERRIDES + _NO_SESSION)
 
 
+def wine_version() -> str:
+    """Wine and its version, for people and for the metadata of results: `Wine 8.0`; `Wine` where there is none.
+
+    Raises:
+        LoadFailed: the program that is installed does not tell it.
+    """
+    return "Wine" if wine_program() is None else f"Wine {_version().removeprefix('wine-').split()[0]}"
+
+
 def windows_path(path: Path) -> str:
     r"""The path as Windows code under Wine sees it: `/tmp/a` is `Z:\tmp\a`."""
     return str(PureWindowsPath(f"Z:{path.absolute()}"))
@@ -91,13 +101,18 @@ def windows_uri(path: Path) -> str:
 
 
 @functools.cache
-def _version(program: Path) -> str:
-    asked = [str(program), "--version"]
-    done = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=60)
-    if not done.stdout.startswith("wine-"):
-        said = (done.stderr or done.stdout).strip() or "nothing"
+def _version() -> str:
+    """The version in Wine's own words: `wine-8.0 (Debian 8.0~repack-4)`."""
+    program = wine_program() or "wine"
+    try:
+        asked = [str(program), "--version"]
+        done = subprocess.run(asked, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=60)
+        said = done.stdout.strip() or done.stderr.strip() or "nothing"
+    except (OSError, subprocess.TimeoutExpired) as error:
+        said = str(error)
+    if not said.startswith("wine-"):
         raise LoadFailed(f"'{program}' does not tell its version; it says: {said[:200]}", hint="Install Wine again.")
-    return done.stdout
+    return said
 
 
 def _environment(prefix: Path, overrides: str) -> dict[str, str]:
@@ -129,10 +144,9 @@ def _wait_for(lock: int, prefix: Path) -> None:
 
 def _make(program: Path, prefix: Path) -> None:
     """Make the prefix under another name, and rename it at the end."""
-    draft = prefix.with_name(f"{prefix.name}.draft")
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir(mode=0o700)
-    environment = _environment(draft, _OVERRIDES)
+    draft = prefix.with_name(f"{prefix.name}.{os.getpid()}.draft")
+    if (server := shutil.which("wineserver")) is None:
+        raise LoadFailed("'wineserver', which belongs to Wine, is not on the PATH.", hint=f"{INSTALL_WINE}.")
 
     def run(*command: str) -> str:
         # Wine's services inherit the output, so the end of a pipe would be that of all of them.
@@ -142,17 +156,22 @@ def _make(program: Path, prefix: Path) -> None:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                env=environment,
+                env=_environment(draft, _OVERRIDES),
                 check=False,
                 timeout=_PREPARE_S,
             )
             output.seek(0)
             return output.read().decode(errors="replace")
 
+    for left in prefix.parent.glob(f"{prefix.name}.*.draft"):
+        subprocess.run(
+            [server, "--kill"], env=_environment(left, _OVERRIDES), capture_output=True, check=False, timeout=_PREPARE_S
+        )
+        shutil.rmtree(left, ignore_errors=True)
+    draft.mkdir(mode=0o700)
     said = run(str(program), "wineboot", "--init")
     variables = run(str(program), "cmd", "/c", "set")
-    if server := shutil.which("wineserver"):
-        run(server, "--wait")  # it writes the registry at its end
+    run(server, "--wait")  # it writes the registry at its end
     if not (draft / "system.reg").is_file():
         raise LoadFailed(f"Wine cannot make a prefix; it says: {said.strip()[-500:] or 'nothing'}")
     if found := re.search(r"WINEDLLDIR0=.*?[Zz]:(\\.*?)\s*\n", variables):

@@ -13,17 +13,17 @@ of its arguments are those that FMPy knows. Steps do not come here: `rings/hoste
 from __future__ import annotations
 
 import ctypes
-import inspect
+import logging
 import mmap
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from itertools import accumulate
 from pathlib import Path
 from struct import pack, unpack
-from types import UnionType
-from typing import Any, Final, NamedTuple, get_args
+from typing import Any, Final
 
 from fmpy.fmi1 import fmi1CallbackFunctions
 from fmpy.fmi2 import fmi2CallbackFunctions
@@ -31,11 +31,13 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 from ...rings import native
 from ...rings.library import host_program
 from ...rings.native import Changed, declared, table
-from .fmu_library import absent
+from .fmu_library import Argument, absent, arguments_of, count_of
 from .fmu_values import FATAL
 from .wine import windows_path, wine_environment, wine_program
 
 __all__ = ["Request", "WineLibrary"]
+
+log = logging.getLogger(__name__)
 
 _SIZE: Final = 1 << 30
 """Of the memory, in bytes; what is not used takes no space."""
@@ -46,9 +48,9 @@ _END_S: Final = 5.0
 _WITH_US: Final = "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); os.execv(sys.argv[1], sys.argv[1:])"
 """A program of Python that becomes another one, which the kernel kills with the thread that has started it."""
 _TEXT: Final = ctypes.c_char_p
+_BYTES: Final = ctypes.POINTER(ctypes.c_uint8)
+"""A value of type Binary; an argument before those of a call says how long each is (FMI 3.0, 2.2.6.2)."""
 _PLACE: Final = ctypes.c_void_p
-_POINTER: Final[Any] = ctypes.POINTER(ctypes.c_int).__base__
-_FUNCTION: Final[Any] = ctypes.CFUNCTYPE(None).__base__
 
 
 class Request(IntEnum):
@@ -70,28 +72,6 @@ class MailboxTable(Changed):
 @declared("Host")
 class HostTable(Changed):
     """A host."""
-
-
-class _Argument(NamedTuple):
-    """One argument of a function of FMI."""
-
-    name: str
-    type: Any  # of ctypes
-    items: Any  # the type of what it points to; None if it is no pointer
-
-    @classmethod
-    def of(cls, known: inspect.Parameter) -> _Argument:
-        """As FMPy has it."""
-        own = known.annotation
-        type_ = get_args(own)[0] if isinstance(own, UnionType) else own
-        is_pointer = issubclass(type_, _POINTER)
-        return cls(known.name, type_, type_._type_ if is_pointer else None)
-
-    @property
-    def passed(self) -> Any:  # noqa: ANN401 as above
-        """The type of ctypes that our functions get it in."""
-        is_address = self.items is not None or issubclass(self.type, _FUNCTION)
-        return _PLACE if is_address else self.type
 
 
 class _Room:
@@ -154,7 +134,7 @@ class WineLibrary:
         assert process.stdin is not None
         assert process.stdout is not None
         os.set_blocking(process.stdin.fileno(), False)
-        self._table.note(to=process.stdin.fileno(), from_=process.stdout.fileno())
+        self._table.note(to=process.stdin.fileno(), from_=process.stdout.fileno(), process=process.pid)
 
     @property
     def address(self) -> int:
@@ -212,17 +192,19 @@ class WineLibrary:
 
     def _function(self, name: str, there: int) -> Any:  # noqa: ANN401 as in ctypes
         """A function of C that lets the host call the one at ``there``."""
-        known = inspect.signature(
-            getattr(self._types, name if name.startswith("fmi") else f"fmi1{name.rpartition('_fmi')[2]}")
-        )
-        arguments = [_Argument.of(one) for one in list(known.parameters.values())[1:]]
-        result = {bytes: _PLACE, int: ctypes.c_int}.get(known.return_annotation, known.return_annotation)
+        known = name if name.startswith("fmi") else f"fmi1{name.rpartition('_fmi')[2]}"
+        arguments, returned_type = arguments_of(self._types, known)
+        result = {bytes: _PLACE, int: ctypes.c_int}.get(returned_type, returned_type)
 
         def call(*values: Any) -> Any:  # noqa: ANN401 as in ctypes
-            returned = self._call(name, there, arguments, values)
+            try:
+                returned = self._call(name, there, arguments, values)
+            except MemoryError as error:  # ctypes would return 0, which is OK
+                log.error("%s: %s: %s", self._name.value.decode(), name, error)  # noqa: TRY400  a traceback helps no user
+                return FATAL if result is ctypes.c_int else None
             if result is ctypes.c_int:
                 return FATAL if self._table.ended else ctypes.c_int(returned).value
-            if known.return_annotation is bytes and returned:
+            if returned_type is bytes and returned:
                 room = _Room(self._memory, self._box.there)
                 self._texts = self._copied(room, room.put(pack("<q", returned)), 1)
                 return ctypes.addressof(self._texts[0])
@@ -234,9 +216,9 @@ class WineLibrary:
         self._table.note(functions=self._functions, n_functions=len(self._twins))
         return function
 
-    def _call(self, name: str, there: int, arguments: Sequence[_Argument], values: Sequence[Any]) -> int:
+    def _call(self, name: str, there: int, arguments: Sequence[Argument], values: Sequence[Any]) -> int:
         room, after = _Room(self._memory, self._box.there), list[Callable[[], None]]()
-        places = []
+        places: list[int] = []
         for index, (own, value) in enumerate(zip(arguments, values, strict=True)):
             if own.items is fmi2CallbackFunctions:
                 environment = fmi2CallbackFunctions.from_address(value).componentEnvironment or 0
@@ -250,7 +232,9 @@ class WineLibrary:
             elif own.type is _TEXT:
                 place = room.put(_located(own.name, value) + b"\0")
             elif own.items is not None:
-                place = self._put_array(room, name, own, value, _count(arguments, values, index), after)
+                # The sizes of Binary values are the argument before them, here and in the host.
+                sizes = (values[index - 1], places[-1]) if own.items is _BYTES else (0, 0)
+                place = self._put_array(room, name, own, value, count_of(arguments, values, index), sizes, after)
             elif own.type is ctypes.c_double:
                 (place,) = unpack("<q", pack("<d", value))
             else:
@@ -262,18 +246,33 @@ class WineLibrary:
         return result
 
     def _put_array(  # noqa: PLR0913, PLR0917 an argument, and what becomes of it
-        self, room: _Room, name: str, own: _Argument, address: int, count: int, after: list[Callable[[], None]]
+        self,
+        room: _Room,
+        name: str,
+        own: Argument,
+        address: int,
+        count: int,
+        sizes: tuple[int, int],
+        after: list[Callable[[], None]],
     ) -> int:
-        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it."""
+        """Copy what an argument points to; ``after`` gets what copies it back. Returns where the host has it.
+
+        ``sizes`` are the addresses of the sizes of Binary values, of this process and of the host.
+        """
         is_set = "Set" in name
-        if own.items is _TEXT:
+        if own.items in {_TEXT, _BYTES}:
             here = (_PLACE * count).from_address(address)
-            texts = (_TEXT * count).from_address(address)
-            given = [room.put((text or b"") + b"\0") for text in texts] if is_set else [0] * count
+            given = [0] * count
+            if is_set:
+                lengths = (ctypes.c_size_t * count).from_address(sizes[0]) if sizes[0] else [-1] * count
+                given = [
+                    room.put(ctypes.string_at(text, length) + b"\0") if text else 0
+                    for text, length in zip(here, lengths, strict=True)
+                ]
             place = room.put(pack(f"<{count}q", *given))
 
             def copy() -> None:
-                self._texts = self._copied(room, place, count)
+                self._texts = self._copied(room, place, count, sizes[1])
                 for number, text in enumerate(self._texts):
                     here[number] = ctypes.addressof(text)
 
@@ -288,12 +287,21 @@ class WineLibrary:
             after.append(copy)
         return place
 
-    def _copied(self, room: _Room, pointers: int, count: int) -> list[Any]:
-        """Texts that the FMU has returned; they live until it returns others."""
+    def _copied(self, room: _Room, pointers: int, count: int, sizes: int = 0) -> list[Any]:
+        """Texts that the FMU has returned, or with ``sizes`` bytes; they live until it returns others."""
         first = room.put(b"")
-        size = self._ask(Request.COPY_TEXTS, pointers, count, 0, first, _SIZE // 2)
-        texts = room.taken(first, size).split(b"\0")[:count]
-        return [ctypes.create_string_buffer(text) for text in texts]
+        used = self._ask(Request.COPY_TEXTS, pointers, count, sizes, first, _SIZE // 2)
+        if used > _SIZE // 2:
+            raise MemoryError(f"values of an FMU under Wine have more than {_SIZE // 2:,} bytes")
+        copied = room.taken(first, used)
+        if not sizes:
+            return [ctypes.create_string_buffer(text) for text in copied.split(b"\0")[:count]]
+        lengths = unpack(f"<{count}Q", room.taken(sizes, count * 8))
+        ends = accumulate(length + 1 for length in lengths)
+        return [
+            ctypes.create_string_buffer(copied[end - length - 1 : end - 1], length + 1)
+            for length, end in zip(lengths, ends, strict=True)
+        ]
 
     def _ask(self, what: Request, *arguments: int) -> int:
         """Let the host answer a request; 0 if it has ended."""
@@ -302,17 +310,6 @@ class WineLibrary:
         box.arguments[: len(arguments)] = arguments
         assert native.library is not None
         return int(box.result) if native.library.host_ask(self.address) else 0
-
-
-def _count(arguments: Sequence[_Argument], values: Sequence[Any], index: int) -> int:
-    """How many items an argument points to: the next number of that type says it, or else the one before (FMI)."""
-    own = arguments[index]
-    if own.items is _PLACE:  # a state
-        return 1
-    sizes = [place for place, one in enumerate(arguments) if one.type is ctypes.c_size_t]
-    if own.name == "dvUnknown":  # of FMI 2.0, after the known ones
-        return int(values[sizes[0]])
-    return next((int(values[place]) for place in (*(s for s in sizes if s > index), *sizes[::-1])), 1)
 
 
 def _located(name: str, text: bytes) -> bytes:

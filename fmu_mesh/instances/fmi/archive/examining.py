@@ -26,11 +26,7 @@ from .repairing import repair
 __all__ = ["examine", "find_library", "library_folders", "library_name", "names_here", "source_names"]
 
 _SHOWN: Final = 3
-_COMPONENT: Final = (
-    "Its binary for WebAssembly is a component of the draft FMI-LS-WASM, which fmu_mesh does not run: export it with "
-    "its sources, which `process: {sandbox: wasm}` compiles for WebAssembly."
-)
-_SUFFIXES: Final[dict[Runs, str]] = {"native": str(fmpy.sharedLibraryExtension), "wine": ".dll"}
+_SUFFIXES: Final[dict[Runs, str]] = {"native": str(fmpy.sharedLibraryExtension), "wine": ".dll", "wasm": ".wasm"}
 
 _ARM: Final = "aarch64-linux"
 _PROCESSORS: Final = {62: "x86_64", 183: "aarch64"}
@@ -89,6 +85,8 @@ def library_folders(fmi_version: str, runs: Runs = "native") -> tuple[str, ...]:
 
     For ARM, FMI 2.0 takes the name of FMI 3.0. OpenModelica writes that of Debian, or on ARM itself `linux64`.
     """
+    if runs == "wasm":
+        return ("wasm32-wasip2",)  # of the draft FMI-LS-WASM for FMI 3.0
     if runs == "wine":
         return ("x86_64-windows" if fmi_version.startswith("3") else "win64",)
     if fmpy.platform_tuple == _ARM and not fmi_version.startswith("3"):
@@ -125,21 +123,27 @@ def source_names(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if re.fullmatch(r"sources/.*\.(c|cc|cpp|cxx)", name))
 
 
-def find_library(path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str) -> str | None:
+def find_library(
+    path: Path, names: Collection[str], identifiers: Sequence[str], fmi_version: str, *, in_sandbox: bool = False
+) -> str | None:
     """Find the library of an FMU for this platform: the one with the required name, or else the only one.
 
     ``identifiers`` are the model identifier of the kind to use, and that of the other kind if there is one. None: the
-    library has to be compiled from sources. Without both, it is that for Windows, if Wine is installed. `LoadFailed`:
-    there is none that can run here, or there are several.
+    library has to be compiled from sources. Without both, it is a component of WebAssembly, or that for Windows, if
+    Wine is installed; ``in_sandbox`` of WebAssembly, only sources or a component count. `LoadFailed`: there is none
+    that can run here, or there are several.
     """
     identifier = identifiers[0]
     if "/" in identifier or "\\" in identifier or identifier.startswith("."):
         raise LoadFailed(f"'{path}' has the model identifier '{identifier}', which cannot be the name of a library.")
     wanted = library_name(identifier, fmi_version, names)
-    if (found := _library(path, names, identifiers, fmi_version, "native")) is not None:
+    if not in_sandbox and (found := _library(path, names, identifiers, fmi_version, "native")) is not None:
         return found
     if identifier and source_names(names):
         return None
+    component = _library(path, names, identifiers, fmi_version, "wasm") if fmi_version.startswith("3") else None
+    if component is not None or in_sandbox:
+        return component
     what = f"'{path}' has no '{wanted}'" if identifier else _WITHOUT_IDENTIFIER.format(path)
     if known := [name for one in identifiers[1:] if (name := library_name(one, fmi_version, names)) in names]:
         raise LoadFailed(
@@ -161,7 +165,7 @@ def find_library(path: Path, names: Collection[str], identifiers: Sequence[str],
     raise LoadFailed(
         f"'{path}' has no binary for this platform ({wanted.split('/')[1]}); it has: "
         f"{', '.join(platforms) or 'no platform at all'}.",
-        hint=_COMPONENT if any(name.startswith("wasm") for name in platforms) else f"{ways}.",
+        hint=f"{ways}.",
     )
 
 

@@ -19,7 +19,7 @@ from fmpy.validation import validate_model_description
 from msgspec.structs import replace
 
 from ....errors import LoadFailed
-from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription, Runs
+from ....variables.model_description import Causality, Clock, DefaultExperiment, Kind, ModelDescription, runs_of
 from ..step_options import Terms
 from .archive import Contents, OpenFmu, opened
 from .declared_variables import number, states_of, variables_of
@@ -46,8 +46,10 @@ def read_description(
         return description_of(fmu, kind, to_run=to_run)
 
 
-def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_run: bool = True) -> ModelDescription:
-    """As `read_description`, for an FMU that is open."""
+def description_of(
+    fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_run: bool = True, in_sandbox: bool = False
+) -> ModelDescription:
+    """As `read_description`, for an FMU that is open; ``in_sandbox`` of WebAssembly, where no library of it runs."""
     path = fmu.path
     contents, root, problems = examine(fmu)
     source = parsed(path, contents)
@@ -58,13 +60,14 @@ def description_of(fmu: OpenFmu, kind: Literal["auto"] | Kind = "auto", *, to_ru
             f"the modelDescription.xml of '{path}' has no ModelStructure, which has its continuous states."
         )
     platforms = tuple(fmpy.supported_platforms(_readable(contents)))
-    if any(name.startswith("binaries/aarch64-linux") for name in contents.names):
-        platforms += ("aarch64-linux",)  # FMPy does not know it
+    for unknown in ("aarch64-linux", "wasm32-wasip2"):  # to FMPy
+        if any(name.startswith(f"binaries/{unknown}") for name in contents.names):
+            platforms += (unknown,)
     interfaces = [_interface(source, kind), *(_interface(source, other) for other in _WORDS if other != kind)]
     identifiers = [one.modelIdentifier or "" for one in interfaces if one is not None]
     names = names_here(fmu, contents.names, version) if to_run else frozenset()
-    library = find_library(path, names, identifiers, version) if to_run else None
-    runs: Runs = "wine" if library is not None and library.endswith(".dll") else "native"
+    library = find_library(path, names, identifiers, version, in_sandbox=in_sandbox) if to_run else None
+    runs = runs_of(library)
     if library is not None and library != (wanted := library_name(identifiers[0], version, names, runs)):
         what = (
             f"is not named as FMI demands, '{wanted}'" if identifiers[0] else "is all that tells the model identifier"

@@ -31,6 +31,7 @@ from msgspec.structs import replace
 from .... import files
 from ....archives.archive_entries import reading
 from ....errors import LoadFailed
+from ....installing import version_of_library
 from ....variables.model_description import Kind, ModelDescription
 from ..step_options import Terms
 from ..webassembly import compiling
@@ -173,6 +174,8 @@ def describe(
                 _fill(fmu, tell, model, Path(folder))
         elif model.runs == "wine":
             wine_environment(tell)
+        elif model.runs == "wasm":
+            version_of_library("wasmtime")
     return model
 
 
@@ -190,7 +193,7 @@ def needs_compiler(path: Path, terms: Terms, kind: Literal["auto"] | Kind, guest
 
 
 def _model_of(fmu: OpenFmu, kind: Literal["auto"] | Kind, guest_memory: int | None) -> ModelDescription:
-    model = description_of(fmu, kind)
+    model = description_of(fmu, kind, in_sandbox=guest_memory is not None)
     return model if guest_memory is None else compiling.as_guest(fmu.path, model, guest_memory)
 
 
@@ -215,7 +218,9 @@ def _add_library(fmu: OpenFmu, folder: Path, model: ModelDescription | None, tel
     """Copy the compiled library of an FMU to where FMI expects it."""
     if (build := _build_of(fmu, folder, model)) is None:
         if model is not None and model.guest_memory is not None:
-            raise LoadFailed(f"'{fmu.path}' has no sources, which `sandbox: wasm` needs.")
+            raise LoadFailed(
+                f"'{fmu.path}' has neither sources nor a component, and `sandbox: wasm` needs one of them."
+            )
         return  # the error of loading it says what is missing
     library = _compiled(fmu.path, folder / "sources", build, tell)
     target = folder / library_name(build.identifier, build.fmi_version)

@@ -1,7 +1,7 @@
 """Compiles the sources of an FMU for WebAssembly, into a library that looks like any other (ADR 101).
 
-Owns the two C files of the sandbox, the compiler and the version of wasmtime that they are written for. The library has
-the module in it, as wasmtime has compiled it for this processor, and calls the library of wasmtime where it is now.
+Owns the two C files of the sandbox, and the compiler. The library has the module in it, as wasmtime has compiled it for
+this processor, and calls the library of wasmtime where it is now.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from .... import files
 from ....errors import LoadFailed
-from ....installing import require
+from ....installing import version_of_library
 from ....variables.model_description import ModelDescription
 
 if TYPE_CHECKING:
@@ -28,20 +28,21 @@ __all__ = ["FOLDER", "as_guest", "compiler", "environment", "make_library"]
 FOLDER: Final = Path(__file__).parent
 """That of the C files."""
 
-WASMTIME: Final = "50."
-"""The major version of wasmtime whose structures `host.c` has."""
-
 _TARGET: Final = ("-target", "wasm32-wasi", "-O2", "-g0", "-ffp-contract=off", "-fvisibility=default")
 _REACTOR: Final = ("-mexec-model=reactor", "-rdynamic", "-Wl,--export=__stack_pointer", "-Wl,-z,stack-size=1048576")
 _HOST_FLAGS: Final = ("-std=gnu23", "-O2", "-g0", "-fPIC", "-shared", "-fvisibility=hidden")
 
 
 def as_guest(path: Path, model: ModelDescription, memory: int) -> ModelDescription:
-    """The description of an FMU that runs in a sandbox with so many bytes: any can get, set and serialize its state.
+    """The description of an FMU that runs in a sandbox with so many bytes.
+
+    What is compiled for it can get, set and serialize its state; a component is as it says.
 
     Raises:
         LoadFailed: it is an FMU of FMI 1.0.
     """
+    if model.runs == "wasm":
+        return replace(model, guest_memory=memory)
     if model.fmi_version.startswith("1."):
         raise LoadFailed(f"'{path}' is an FMU of FMI 1.0, and `sandbox: wasm` is for those of FMI 2.0 and 3.0.")
     able = {"can_get_and_set_state": True, "can_serialize_state": True}
@@ -52,19 +53,10 @@ def compiler(*, plus: bool) -> list[str]:
     """The command that compiles for WebAssembly, and the version of wasmtime for the key of what it makes.
 
     Raises:
-        LibraryMissing: ziglang or wasmtime is not installed.
-        LoadFailed: wasmtime has another version.
+        LibraryMissing: ziglang or wasmtime is not installed, or has another version than the extra `wasm`.
     """
-    from importlib import metadata  # noqa: PLC0415  slow, and only guests need it
-
-    require("ziglang")
-    require("wasmtime")
-    version = metadata.version("wasmtime")
-    if not version.startswith(WASMTIME):
-        raise LoadFailed(
-            f"wasmtime {version} is installed, and the sandbox is written for {WASMTIME}x.",
-            hint=f"`pip install 'wasmtime=={WASMTIME}*'`",
-        )
+    version_of_library("ziglang")
+    version = version_of_library("wasmtime")
     # Nothing that a guest throws could be caught: the compiler has no exceptions for WebAssembly.
     flags = ["-fno-exceptions"] if plus else []
     return [sys.executable, "-m", "ziglang", "c++" if plus else "cc", *_TARGET, *flags, f"-DWASMTIME={version}"]
