@@ -561,6 +561,11 @@ NOT_RUN = [
         "it needs a Slurm cluster; tests/sweeps/test_slurm.py runs it on one of two hosts",
     ),
     (
+        "docs/windows_fmus.md",
+        "$ sudo apt install wine",
+        "it installs Wine; tests/wine/test_windows_meshes.py inspects such an FMU",
+    ),
+    (
         "examples/cart_pole/README.md",
         "python examples/cart_pole/train.py --output policy.onnx",
         "it takes a minute; tests/physics/test_cart_pole.py runs it with less training",
